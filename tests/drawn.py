@@ -10,11 +10,11 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from vap_core.base.types import Ballot, Boxes, Camera, Event, Grounding, Mask, Rgb, Track
-from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder
 from vap_core.recording.stream import rerun_command
 from vap_core.rollout.types import EpisodeHeader, Frame
 from vap_core.simulation.types import ROBOT, EpisodeRow, Outcome, Placement, Truth
+from vap_core.study.diagnosis import explain
 
 SIDE, K = 224, 5
 SIZES = {"owl_a": (0.07, 0.07, 0.11), "owl_b": (0.07, 0.07, 0.10), "owl_c": (0.06, 0.08, 0.11)}

@@ -26,9 +26,8 @@ def main() -> int:
 
     import torch
 
-    from vap_core.evaluation.study import Study
-    from vap_core.evaluation.trials import make_trial, register_personal
     from vap_core.rollout.loop import rollout
+    from vap_core.study.trials import Study, make_trial, register_personal
 
     torch.set_num_threads(asked.threads)
     study = Study(((SUITE, TASK),), tuple(asked.methods), policy="mini-pi0", follow="step")

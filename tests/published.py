@@ -3,11 +3,8 @@
 import pandas as pd
 
 from tests.pages import ROOT
-from vap_core.evaluation.metrics import Rate, rate
-from vap_core.evaluation.publish import read_runs
-from vap_core.evaluation.statistics import (
-    rate_over_layouts,
-)
+from vap_core.study.results import read_runs
+from vap_core.study.stats import Rate, rate, rate_over_layouts
 
 RESULTS = ROOT / "data" / "results"
 

@@ -25,7 +25,7 @@ LIMIT_S = 120.0
 
 
 def write_report(run: Path, out: Path) -> None:
-    from vap_core.evaluation.report import report
+    from vap_core.study.report import report
 
     report([run], out)
 
@@ -117,7 +117,7 @@ class Server:
 NEEDED = (
     "matplotlib.backends.backend_agg",
     "vap_core.analysis.ground_clip",
-    "vap_core.evaluation.report",
+    "vap_core.study.report",
     "vap_core.recording",
 )
 """What the work of `FILES` imports."""

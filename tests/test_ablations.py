@@ -27,26 +27,36 @@ from vap_core.attend import Prompting
 from vap_core.base.errors import BadOutput, BadStudy
 from vap_core.base.tables import signed
 from vap_core.base.types import Colour, Mask, Rgb
-from vap_core.evaluation import hiding, methods, paper, switching
-from vap_core.evaluation.ablations import run as ablation_run
-from vap_core.evaluation.ablations.arms import ABLATIONS, ARMS, TINT_SHARES, Ablation, Hidden
-from vap_core.evaluation.ablations.arrow import Arrow
-from vap_core.evaluation.ablations.picture import effects_figure, policies_figure
-from vap_core.evaluation.ablations.run import arm_folder
-from vap_core.evaluation.ablations.table import (
-    ArmResult,
-    across_policies,
-    arm_results,
-    arm_rows,
-    policy_results,
-)
-from vap_core.evaluation.methods import METHODS, PUBLISHED, find, known_methods, references_needed
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.report.cells import comparison_rows
-from vap_core.evaluation.statistics import Comparison, rate_over_layouts
-from vap_core.evaluation.study import Study
 from vap_core.prompt import PALETTE, PromptForm, Tint, tint
 from vap_core.rollout.types import MaskCoverage
+from vap_core.study import ablations as ablation_run
+from vap_core.study import logs, methods, paper
+from vap_core.study.ablations import (
+    ArmResult,
+    across_policies,
+    arm_folder,
+    arm_results,
+    arm_rows,
+    effects_figure,
+    policies_figure,
+    policy_results,
+)
+from vap_core.study.forms import Arrow
+from vap_core.study.methods import (
+    ABLATIONS,
+    ARMS,
+    METHODS,
+    PUBLISHED,
+    TINT_SHARES,
+    Ablation,
+    Hidden,
+    find,
+    known_methods,
+    references_needed,
+)
+from vap_core.study.report import comparison_rows
+from vap_core.study.stats import Comparison, rate, rate_over_layouts
+from vap_core.study.trials import Study
 
 WORDS = ("--suite", "widowx-pick", "--policy", "scripted", "--episodes", "1", "--workers", "1")
 
@@ -222,15 +232,15 @@ def test_the_track_is_kept_that_is_on_the_target_soon_after_it_is_seen_again() -
     def seen(shown: str | None, pixels: int = 500) -> list[MaskCoverage]:
         return [MaskCoverage(camera="c", object=shown, iou=0.9, pixels=pixels, proposal=np.nan)]
 
-    assert hiding.is_track_kept([[], seen("mine")], "mine") is True
-    assert hiding.is_track_kept([seen(None), [], seen("mine")], "mine") is True
-    assert hiding.is_track_kept([seen(None), seen("other"), seen("mine")], "mine") is False
-    assert hiding.is_track_kept([seen("mine", pixels=20), []], "mine") is None
+    assert logs.is_track_kept([[], seen("mine")], "mine") is True
+    assert logs.is_track_kept([seen(None), [], seen("mine")], "mine") is True
+    assert logs.is_track_kept([seen(None), seen("other"), seen("mine")], "mine") is False
+    assert logs.is_track_kept([seen("mine", pixels=20), []], "mine") is None
     rows = outcomes("hidden-2", [True] * 4).assign(hidden_s=1.6)
     rows["track_kept"] = [True, True, False, None]
-    (line,) = hiding.hiding_lines(rows)
+    (line,) = logs.hiding_lines(rows)
     assert line == (f"simpler-bridge hidden-2: hidden for 1.6 s, track kept in {rate(2, 3)}")
-    assert hiding.hiding_lines(outcomes("vap", [True])) == []
+    assert logs.hiding_lines(outcomes("vap", [True])) == []
 
 
 def test_layouts_that_return_do_not_narrow_what_is_said_of_tracks_and_switches() -> None:
@@ -238,7 +248,7 @@ def test_layouts_that_return_do_not_narrow_what_is_said_of_tracks_and_switches()
     once = outcomes("arm", held).assign(hidden_s=1.6, track_kept=held, switched_s=1.0)
     once = once.assign(turned_s=None, obeyed=held)
     again = pd.concat([once.assign(seed=seed) for seed in range(10)], ignore_index=True)
-    for lines in (hiding.hiding_lines, switching.switching_lines):
+    for lines in (logs.hiding_lines, logs.switching_lines):
         (few,), (many,) = lines(once), lines(again)
         assert f"in {rate(9, 10)}" in few, "Wilson's where no layout returns"
         assert f"in {rate_over_layouts(again)}" in many

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from vap_core.evaluation.abstention import THRESHOLDS, abstention_rows, abstentions
+from vap_core.study.stats import THRESHOLDS, abstention_rows, abstentions
 
 EPISODES = [
     ("tabletop", "vap", 1.0, True, True),

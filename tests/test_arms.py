@@ -13,9 +13,6 @@ from tests.test_methods import ALIKE, GREY, LINE, MUG, RED, ROW, TEAL, looking, 
 from tests.toys import TOYS, observation, personal
 from vap_core.attend import Attender
 from vap_core.base.errors import BadStudy
-from vap_core.evaluation.methods import find, make_prompter, needs_memory, needs_stack
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.switching import columns, switching_lines
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import tint
 from vap_core.rollout.loop import Trial, rollout
@@ -27,6 +24,9 @@ from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import Observation
+from vap_core.study.logs import switch_columns, switching_lines
+from vap_core.study.methods import find, make_prompter, needs_memory, needs_stack
+from vap_core.study.trials import Study
 
 TASK = ("simpler-bridge", "put-camera")
 
@@ -95,7 +95,7 @@ def test_reaction_and_obedience_are_read_from_an_episode() -> None:
         (episode,) = rollout(trial, [row])
     assert trial.bound
     rival = prompter.after.prompted_object(row)
-    found = columns(episode)
+    found = switch_columns(episode)
     assert found["switched_s"] == pytest.approx(1 / 5)
     assert not found["obeyed"]
 
@@ -109,18 +109,22 @@ def test_reaction_and_obedience_are_read_from_an_episode() -> None:
         return replace(frame, state=state, truth=replace(frame.truth, touched=touched))
 
     played = replace(episode, frames=tuple(map(told, episode.frames)))
-    found = columns(played)
+    found = switch_columns(played)
     assert found["obeyed"]
     assert found["turned_s"] == pytest.approx((4 - 1) / 5)
-    assert columns(replace(played, frames=played.frames[:2])) == {}, "no action follows"
-    assert columns(replace(played, frames=played.frames[:3])) != {}
+    assert switch_columns(replace(played, frames=played.frames[:2])) == {}, "no action follows"
+    assert switch_columns(replace(played, frames=played.frames[:3])) != {}
     stays = replace(played, frames=played.frames[:4])
-    assert columns(stays) == {"switched_s": found["switched_s"], "turned_s": None, "obeyed": False}
+    assert switch_columns(stays) == {
+        "switched_s": found["switched_s"],
+        "turned_s": None,
+        "obeyed": False,
+    }
     switched = replace(played.frames[4], events=played.frames[1].events)
     there = replace(played, frames=(switched, played.frames[2], played.frames[5]))
-    assert columns(there)["turned_s"] is None, "it was nearer to the rival before the switch"
-    stored_before = {**columns(there), "turned_s": 0.0}
-    rows = [columns(played), columns(stays), stored_before, {}]
+    assert switch_columns(there)["turned_s"] is None, "it was nearer to the rival before the switch"
+    stored_before = {**switch_columns(there), "turned_s": 0.0}
+    rows = [switch_columns(played), switch_columns(stays), stored_before, {}]
     table = pd.DataFrame(rows).assign(
         suite=TASK[0], task=TASK[1], episode=range(4), seed=0, outcome="failure",
         method=["switched-early"] * 3 + ["oracle-track"],

@@ -16,11 +16,11 @@ from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.events import is_lost
 from vap_core.base.types import Attended, Boxes, Colour, Grounding, Rgb, Views
-from vap_core.evaluation.ablations.forms import NumberedMarker
 from vap_core.perception.protocols import Thresholds
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE, Tint, tint
+from vap_core.study.forms import NumberedMarker
 from vap_core.vote import vote
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
@@ -632,7 +632,6 @@ def test_one_camera_may_look_up_and_not_all() -> None:
 
 def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> None:
     """From the true boxes of the real models; the mug is remembered by what the front camera sees, so that its own view is beyond doubt."""
-    from vap_core.evaluation.methods import METHODS
     from vap_core.memory import remember
     from vap_core.perception.boxes import crop
     from vap_core.rollout.loop import Trial, rollout
@@ -640,6 +639,7 @@ def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> 
     from vap_core.simulation.env import Env
     from vap_core.simulation.scenes import build
     from vap_core.simulation.suites import rows, suite
+    from vap_core.study.methods import METHODS
 
     desk, row = suite("tabletop"), rows("tabletop", "select-cup")[3]
     stack = load_stack("embedded")

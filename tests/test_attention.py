@@ -19,9 +19,6 @@ from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.analysis.attention import layer_effects
 from vap_core.base.errors import BadPolicy, UnknownName
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import (
     ACTION,
     attention_observed,
@@ -40,6 +37,7 @@ from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES, named_queries, only_queries
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import Outcome
+from vap_core.study.trials import Study, make_trial, register_personal, shipped
 
 CAMERAS = ("front", "side")
 TOY = replace(tiny.TOY, layers=2)

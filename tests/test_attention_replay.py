@@ -16,10 +16,9 @@ from tests.command import refused, vap
 from vap_core.analysis.attention import examples, replay, tables
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
-from vap_core.evaluation import measurements
-from vap_core.evaluation.publish import read_published
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
+from vap_core.study import store
+from vap_core.study.results import read_published
+from vap_core.study.trials import Study, make_trial
 
 
 def test_tables_are_published_beside_those_of_other_suites(tmp_path: Path) -> None:
@@ -177,7 +176,7 @@ def test_an_episode_that_ended_in_an_error_is_left_out_and_told(
     rows = {name: about for name in tables.TABLES}
     rows["errors"] = [about[1] | {"error": "RuntimeError: no memory left"}]
     part = tmp_path / "part.json"
-    measurements.write_json_part(part, rows, caller="attention")
+    store.write_json_part(part, rows, caller="attention")
     found = replay._write_tables(source, tmp_path, [part])
     assert {name: table.episode.tolist() for name, table in found.items()} == {
         name: [0, 2] for name in tables.TABLES

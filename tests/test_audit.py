@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadOutput, BadPolicy, BadStudy
-from vap_core.evaluation import input_audit
-from vap_core.evaluation.study import DEMO, Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import TEXT, inputs_observed, observe_inputs, report_input
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import Follow, Trial, rollout
 from vap_core.rollout.prompters.text import generic
+from vap_core.study import logs
+from vap_core.study.trials import DEMO, Study, make_trial, register_personal
 
 STUDY = replace(DEMO, tasks=DEMO.tasks[:1], episodes=2)
 ROWS = [replace(row, max_steps=4) for row in STUDY.rows(*STUDY.tasks[0])]
@@ -70,8 +69,8 @@ def test_a_policy_that_is_deaf_to_the_prompt_is_found_out(trial: Trial, tmp_path
 
     episodes = list(rollout(replace(trial, policy=Deaf()), ROWS[:1]))
     assert not any(call.sound for call in episodes[0].consumed)
-    input_audit.write(tmp_path, episodes)
-    said = input_audit.verdict(tmp_path)
+    logs.write_audit(tmp_path, episodes)
+    said = logs.verdict(tmp_path)
     assert "audit vap: 2 policy calls; 2 of 2 images tinted" in said
     assert "4 reached the policy otherwise" in said
     assert "episode 0 step 0: front is missing" in said
@@ -106,8 +105,8 @@ def test_bounds_and_unaudited_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadStudy, match="nothing to audit"):
         Study(STUDY.tasks, ("generic",), policy="random", audit=True)
     with pytest.raises(BadOutput, match="was not audited"):
-        input_audit.read(tmp_path)
-    input_audit.write(tmp_path, [])
+        logs.read_audit(tmp_path)
+    logs.write_audit(tmp_path, [])
     assert not (tmp_path / "audit").exists()
 
 
@@ -136,8 +135,8 @@ def test_what_a_study_asks_for_reaches_its_trials(
 
 def test_a_call_that_a_killed_run_made_too_counts_once(trial: Trial, tmp_path: Path) -> None:
     episodes = list(rollout(trial, ROWS[:1]))
-    input_audit.write(tmp_path, episodes)
-    once = input_audit.verdict(tmp_path)
-    input_audit.write(tmp_path, episodes)
-    assert input_audit.verdict(tmp_path) == once
+    logs.write_audit(tmp_path, episodes)
+    once = logs.verdict(tmp_path)
+    logs.write_audit(tmp_path, episodes)
+    assert logs.verdict(tmp_path) == once
     assert once.startswith("audit vap: 2 policy calls; 2 of 2 images tinted")

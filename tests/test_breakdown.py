@@ -9,19 +9,19 @@ import pytest
 
 from vap_core.base import figures
 from vap_core.base.tables import align
-from vap_core.evaluation.diagnosis import STAGES
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.report.failures import (
+from vap_core.recording import recording_file_name
+from vap_core.rollout.failure import CASES
+from vap_core.study.charts import funnel_figure
+from vap_core.study.diagnosis import STAGES
+from vap_core.study.failures import (
     breakdown,
     breakdown_rows,
     funnel_table,
     sub_cases_table,
     sub_cases_text,
 )
-from vap_core.evaluation.report.funnel import funnel_figure
-from vap_core.evaluation.report.page import report_page
-from vap_core.recording import recording_file_name
-from vap_core.rollout.failure import CASES
+from vap_core.study.report import report_page
+from vap_core.study.stats import rate
 
 STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
 

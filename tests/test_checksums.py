@@ -13,13 +13,6 @@ import pytest
 
 from vap_core.base.errors import BadOutput, MissingWeights
 from vap_core.base.types import Boxes, Rgb
-from vap_core.evaluation.own_objects import run as own_objects
-from vap_core.evaluation.own_objects.folder import Source
-from vap_core.evaluation.perception.run import Survey
-from vap_core.evaluation.photos import run as photos
-from vap_core.evaluation.photos.folder import PhotoSet
-from vap_core.evaluation.store import digest, open_run
-from vap_core.evaluation.study import Study
 from vap_core.perception.embedded.weights import weights_sha256
 from vap_core.perception.foundation.sources import MODELS, TENSORS
 from vap_core.perception.foundation.store import LOCK, VARIABLE
@@ -27,6 +20,13 @@ from vap_core.perception.kept_thresholds import keep_thresholds
 from vap_core.perception.own_parts import describe_parts
 from vap_core.perception.protocols import Encoder, Stack, Thresholds, Tracker
 from vap_core.perception.stacks import STACKS, checksums
+from vap_core.study import objects as own_objects
+from vap_core.study import photos as photos
+from vap_core.study.objects import Source
+from vap_core.study.photos import PhotoSet
+from vap_core.study.store import digest, open_run
+from vap_core.study.survey import Survey
+from vap_core.study.trials import Study
 from vap_make.calibration import run as calibration
 
 from .test_photo_set import folder  # noqa: F401

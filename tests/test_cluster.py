@@ -8,12 +8,12 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadCluster, BadSuite, WorkerDied
-from vap_core.evaluation import cluster, engine, steps
-from vap_core.evaluation.jobs import Job, Rows, run_job
-from vap_core.evaluation.processes import results
-from vap_core.evaluation.state_log import read as read_traces
-from vap_core.evaluation.store import open_run
-from vap_core.evaluation.study import Study
+from vap_core.study import cluster, engine, steps
+from vap_core.study.engine import Job, Rows, run_job
+from vap_core.study.logs import read_states as read_traces
+from vap_core.study.processes import results
+from vap_core.study.store import open_run
+from vap_core.study.trials import Study
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=6)
 

@@ -15,14 +15,13 @@ import torch
 from tests.command import vap
 from vap_core.attend import Attender
 from vap_core.base.errors import BadOutput, UnknownName
-from vap_core.evaluation.store import locked, open_run, read
-from vap_core.evaluation.study import DEMO, Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder, read_summary, recording_name
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.rollout.types import Episode
+from vap_core.study.store import locked, open_run, read
+from vap_core.study.trials import DEMO, Study, make_trial, register_personal
 
 ENV = {**os.environ, "OMP_NUM_THREADS": "1"}
 
@@ -221,7 +220,7 @@ def test_a_run_in_use_is_left_alone(tmp_path: Path) -> None:
 def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     code = (
-        "import os, vap_core.evaluation.engine as e, vap_core.evaluation.study as x\n"
+        "import os, vap_core.study.engine as e, vap_core.study.trials as x\n"
         "from dataclasses import replace; from pathlib import Path\n"
         "def work(job): os.kill(os.getpid(), 9)\n"
         "e.run_job = work\n"

@@ -9,10 +9,6 @@ import pytest
 
 from tests.test_lists import gap_m
 from vap_core.base.errors import BadStudy, UnknownName
-from vap_core.evaluation import layouts
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.same_weights import weights_by_suite
-from vap_core.evaluation.study import Study
 from vap_core.policies.scripted.random import Random
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.text import generic
@@ -21,6 +17,9 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, development, lists, simpler
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study import stats
+from vap_core.study.engine import weights_by_suite
+from vap_core.study.trials import Study, shipped
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES
 
 TASK = ("simpler-bridge-absent", "put-camera")
@@ -52,7 +51,7 @@ def test_no_layout_and_no_object_of_the_list_that_is_reported_returns(name: str)
     for row in tuned:
         assert {place.model for place in row.placements} & models <= props
         assert spots(row) not in stands
-    assert len({layouts.layout_name(row) for row in tuned}) == len(tuned)
+    assert len({stats.layout_name(row) for row in tuned}) == len(tuned)
 
 
 def test_its_objects_are_of_the_task_and_of_no_film(name: str) -> None:

@@ -16,10 +16,10 @@ from tests.test_notebooks import anchors as headings
 from tests.test_stills import COMMITTED
 from vap_core.cli import app
 from vap_core.contracts import plugin
-from vap_core.evaluation.ablations import arms
-from vap_core.evaluation.methods import known_methods
 from vap_core.perception.stacks import STACKS, check_stack
 from vap_core.simulation.suites import SUITES
+from vap_core.study import methods
+from vap_core.study.methods import known_methods
 
 MADE_LATER = ("data/runs", "data/memory", "data/objects", "data/cache", "data/photos")
 """Folders that commands make, and that do not ship."""
@@ -160,8 +160,8 @@ def test_the_ablation_of_five_lines_is_one() -> None:
     (block,) = (block for block in blocks("docs/extend.md", "python") if "Ablation(" in block)
     assert len(block.splitlines()) == 5
     ((name, ablation),) = eval(f"{{{block}}}", vars(arms)).items()
-    assert isinstance(ablation, arms.Ablation)
-    assert name not in arms.ABLATIONS
+    assert isinstance(ablation, methods.Ablation)
+    assert name not in methods.ABLATIONS
     assert not set(ablation.arms) & set(known_methods())
     assert set(ablation.methods) <= set(known_methods())
 

@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 from vap_core.analysis import embeddings as embedding_report
 from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.cli import app
-from vap_core.evaluation.tokens import study
 from vap_core.policies.names import SHIPPED, shipped_checkpoint
 from vap_core.policies.token_groups import token_groups
 from vap_core.simulation import suites
+from vap_core.study import tokens
 
 from . import tiny_lerobot
 from .test_soft_prompt import SUITE, grown  # noqa: F401
@@ -29,7 +29,7 @@ def test_the_report_compares_the_shipped_policies_beside_the_paper() -> None:
 
 
 def test_a_policy_is_measured_beside_the_model_that_it_grew_from() -> None:
-    folders = {study._model_folder(name).name for name in suites.BENCHMARKS}
+    folders = {tokens._model_folder(name).name for name in suites.BENCHMARKS}
     assert folders == {"mini-paligemma-tint-free"}
     successor = SHIPPED / f"mini-pi0-{SUITE}-wide-seed-0"
     table = embedding_report.spaces(None, [successor])

@@ -20,14 +20,13 @@ from tqdm import tqdm
 
 from tests.command import vap
 from vap_core.base.files import DATA
-from vap_core.evaluation import engine, store, trials
-from vap_core.evaluation.engine import missing_jobs, result_key
-from vap_core.evaluation.jobs import Job, Record, row_of_dead_worker
-from vap_core.evaluation.state_log import read as read_traces
-from vap_core.evaluation.store import append, open_run, read, read_manifest
-from vap_core.evaluation.study import Study
 from vap_core.policies.scripted.expert import Expert
 from vap_core.recording import read_summary
+from vap_core.study import engine, store, trials
+from vap_core.study.engine import Job, Record, missing_jobs, result_key, row_of_dead_worker
+from vap_core.study.logs import read_states as read_traces
+from vap_core.study.store import append, open_run, read, read_manifest
+from vap_core.study.trials import Study
 
 STUDY = Study(
     (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")),

@@ -13,9 +13,9 @@ import pytest
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadOutput, VapError
 from vap_core.cli.command import names
-from vap_core.evaluation.rescore import rescore
-from vap_core.evaluation.store import read
 from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study.report import rescore
+from vap_core.study.store import read
 
 SUITE = "simpler-bridge"
 TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]

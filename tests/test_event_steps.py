@@ -10,14 +10,13 @@ import pytest
 from vap_core.attend import Attender
 from vap_core.base.events import is_lost
 from vap_core.base.types import Boxes, PersonalObject, Rgb, Track
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
 from vap_core.perception.protocols import Stack
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.rollout.types import Episode
 from vap_core.simulation.env import Env
+from vap_core.study.trials import Study, make_trial
 
 TASK = ("tabletop", "put-plant")
 """Three cameras."""

@@ -11,20 +11,14 @@ from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
 from vap_core.base import events
 from vap_core.base.files import DATA
 from vap_core.base.types import Attended, Ballot, Boxes, Grounding, Track
-from vap_core.evaluation import diagnosis as failures
-from vap_core.evaluation.diagnosis import (
-    NEIGHBOURS,
-    THRESHOLDS,
-    Thresholds,
-    diagnose,
-    neighbours,
-    stages,
-)
 from vap_core.rollout.coverage import covered_object, mask_coverage
 from vap_core.rollout.failure import CASES
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame, MaskCoverage
 from vap_core.simulation.suites.rules import rejudge
 from vap_core.simulation.types import REST, ROBOT, Outcome, Truth
+from vap_core.study import diagnosis as failures
+from vap_core.study.cases import NEIGHBOURS, THRESHOLDS, Thresholds, neighbours
+from vap_core.study.diagnosis import diagnose, stages
 
 THIRD = "cup-lookalike-2"
 NAN = float("nan")

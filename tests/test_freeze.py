@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vap_core.evaluation import world
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.mujoco_object import add_object
+from vap_core.study import world
 
 import mujoco  # isort: skip
 

@@ -21,9 +21,6 @@ from tests.toys import personal
 from vap_core.base.condition import rows_matching
 from vap_core.base.errors import VapError
 from vap_core.base.photos import load_photo
-from vap_core.evaluation import store
-from vap_core.evaluation.photos.folder import _read_csv
-from vap_core.evaluation.publish import read_published
 from vap_core.instruction import parse
 from vap_core.memory import load as load_object
 from vap_core.memory import save as save_object
@@ -32,6 +29,9 @@ from vap_core.policies.mini_pi0 import token_file
 from vap_core.simulation.assets.scans import mesh_file, storage
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.suites import lists
+from vap_core.study import store
+from vap_core.study.photos import _read_csv
+from vap_core.study.results import read_published
 
 CASES, DAILY = 10_000, 30
 TABLE = pd.DataFrame({"suite": ["a", "b"], "steps": [3, 40], "margin": [0.1, None]})

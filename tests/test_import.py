@@ -57,8 +57,7 @@ def test_type_checkers_see_the_names_that_load() -> None:
     "package",
     [
         "vap_core.analysis",
-        "vap_core.evaluation",
-        "vap_core.evaluation.perception",
+        "vap_core.study",
         "vap_core.rollout",
         "vap_core.simulation",
         "vap_make",
@@ -74,7 +73,7 @@ def test_every_name_of_a_package_exists(package: str) -> None:
     ("module", "absent"),
     [
         # The parent of a run starts its workers at once; only they load a policy.
-        ("vap_core.evaluation.engine", ("torch", "lerobot", "transformers", "rerun")),
+        ("vap_core.study.engine", ("torch", "lerobot", "transformers", "rerun")),
         # A policy in another process needs no lerobot here.
         ("vap_core.policies.lerobot.adapter", ("lerobot", "transformers")),
     ],

@@ -26,12 +26,12 @@ from vap_core.attend import Attender
 from vap_core.base import palette
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.base.types import Mask, Track
-from vap_core.evaluation.perception.first_frames import View
-from vap_core.evaluation.perception.run import TABLES
 from vap_core.rollout.types import Frame
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.suites import BENCHMARKS, rows
 from vap_core.simulation.types import EE_ACTION, Placement, Truth
+from vap_core.study.perception import View
+from vap_core.study.survey import TABLES
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL)])

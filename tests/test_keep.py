@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from tests.drawn import ROW, SUCCESS, columns, frame, opening, rerun
-from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording import recorder as keep
 from vap_core.recording.stream import temporary_path
 from vap_core.simulation.types import Outcome
+from vap_core.study.diagnosis import explain
 
 
 def failed(outcome: Outcome) -> bool:

@@ -25,12 +25,12 @@ from tests.test_scan_storage import METADATA, cube
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.analysis.ground_clip import ground_clip
 from vap_core.base import video
-from vap_core.evaluation.report import report
 from vap_core.memory import remember, save
 from vap_core.perception import stacks
 from vap_core.perception.protocols import Stack
 from vap_core.recording import read_summary
 from vap_core.simulation.assets.scans import storage
+from vap_core.study.report import report
 
 
 def named(folder: Path) -> dict[str, bytes]:

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from tests.toys import Kept
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.types import Frame
 from vap_core.simulation.cameras import Renderer
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.types import EpisodeRow, Outcome
+from vap_core.study.trials import Study, make_trial
 
 TASK = ("tabletop", "put-plant")
 """Its cameras are displaced in every episode, and one is at the wrist."""

@@ -26,9 +26,6 @@ from tests.toys import personal
 from vap_core.base.errors import BadMemory, UnknownName
 from vap_core.base.files import SHIPPED
 from vap_core.cli.own import _task_to_try
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.memory import save
 from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
@@ -37,6 +34,7 @@ from vap_core.policies.lerobot.step import VapEnvConfig, attach
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
 from vap_core.simulation import suites
+from vap_core.study.trials import Study, make_trial, register_personal, shipped
 
 ROOT = Path(__file__).resolve().parents[1]
 PLUGIN = ROOT / "plugins" / "lerobot_env_vap"

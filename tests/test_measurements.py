@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation.measurements import (
+from vap_core.study.store import (
     add_rows,
     publish_tables,
     read_json_part,

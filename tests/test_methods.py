@@ -16,12 +16,6 @@ from tests.toys import TOYS, Kept, observation, personal, scene
 from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadPolicy, BadStudy
 from vap_core.base.types import Description, Views
-from vap_core.evaluation import engine, trials
-from vap_core.evaluation.jobs import run_job
-from vap_core.evaluation.methods import METHODS
-from vap_core.evaluation.store import open_run
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.memory import load_bank
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import PolicyInput
@@ -34,6 +28,11 @@ from vap_core.rollout.prompters.text import HardPrompt, SoftPrompt, TextPrompter
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Observation, Placement
+from vap_core.study import engine, trials
+from vap_core.study.engine import run_job
+from vap_core.study.methods import METHODS
+from vap_core.study.store import open_run
+from vap_core.study.trials import Study, make_trial, register_personal
 
 GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
 RED = PALETTE[0]
@@ -456,7 +455,7 @@ def test_what_has_no_parameters_has_no_checksum() -> None:
 
 
 def test_rows_from_before_there_were_checksums_stay_readable(tmp_path: Path) -> None:
-    from vap_core.evaluation.store import append, read
+    from vap_core.study.store import append, read
 
     run = open_run(tmp_path / "run", {})
     about = {"suite": "s", "task": "t", "method": "m", "seed": 0, "attempt": 1}

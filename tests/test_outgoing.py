@@ -14,9 +14,9 @@ import pytest
 
 from tests.drawn import SUCCESS, frame, opening
 from vap_core.base.errors import MissingGL
-from vap_core.evaluation.cluster import ray_executor
 from vap_core.recording import Recorder, show, stream
 from vap_core.recording.stream import rerun_command, rerun_environment
+from vap_core.study.cluster import ray_executor
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -8,17 +8,15 @@ import pytest
 from tests.command import refused, vap
 from tests.scanned import box, put
 from vap_core.base.errors import BadStudy
-from vap_core.evaluation.feasibility import check_feasible, feasible
-from vap_core.evaluation.report.provenance import command_line
-from vap_core.evaluation.rescore import _rows_by_key
-from vap_core.evaluation.store import read
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import register_personal
 from vap_core.memory import load_bank
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.import_scan import import_scan
 from vap_core.simulation.suites import listed
 from vap_core.simulation.suites.own_object import APART_M, _disc_radii_m, with_object
+from vap_core.study.report import _rows_by_key
+from vap_core.study.results import command_line
+from vap_core.study.store import read
+from vap_core.study.trials import Study, check_feasible, feasible, register_personal
 
 TASKS = (("tabletop", "select-cup"),)
 
@@ -102,7 +100,7 @@ def test_the_expert_says_what_can_be_done():
 
 def test_a_task_that_the_expert_never_does_is_refused(monkeypatch):
     study = Study(TASKS, ("generic",), episodes=1, object="mug")
-    monkeypatch.setattr("vap_core.evaluation.feasibility.feasible", lambda rows: [False])
+    monkeypatch.setattr("vap_core.study.trials.feasible", lambda rows: [False])
     with pytest.raises(BadStudy, match=r"in 0 of 1 episodes; not in 0\. mug may be too wide"):
         check_feasible(study)
 

@@ -13,9 +13,6 @@ from tqdm import tqdm
 from tests.command import refused, vap
 from tests.scanned import box, put
 from vap_core.base.errors import BadObject, BadOutput, BadStudy
-from vap_core.evaluation.own_objects import run as own
-from vap_core.evaluation.own_objects.folder import Source, objects_in, read_source
-from vap_core.evaluation.own_objects.report import Tables, group_rows, object_rows, text_report
 from vap_core.simulation.assets.scans.closed_parts import blob, hollow, lathe, ring, tube
 from vap_core.simulation.assets.scans.design_paint import LOUD, QUIET, SIDE, draw_colours
 from vap_core.simulation.assets.scans.designs import FORMS, HANDLED, draw_design, write_designs
@@ -24,6 +21,16 @@ from vap_core.simulation.assets.scans.mesh_repair import count_edge_flaws
 from vap_core.simulation.assets.scans.storage import VARIABLE
 from vap_core.simulation.assets.triangles import area_vectors
 from vap_core.simulation.suites import suite
+from vap_core.study import objects as own
+from vap_core.study.objects import (
+    Source,
+    Tables,
+    group_rows,
+    object_rows,
+    objects_in,
+    read_source,
+    text_report,
+)
 
 
 def volume(corner: np.ndarray) -> float:

@@ -14,13 +14,12 @@ from vap_core.base.errors import BadPolicy
 from vap_core.base.files import DATA
 from vap_core.base.photos import load_photo, photos_in
 from vap_core.base.types import Rgb
-from vap_core.evaluation.diagnosis import diagnose, explain
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import HIDDEN_FROM, make_trial, register_personal
 from vap_core.memory import remember, save
 from vap_core.perception.stacks import load_stack
 from vap_core.recording import Recorder
 from vap_core.rollout.loop import rollout
+from vap_core.study.diagnosis import diagnose, explain
+from vap_core.study.trials import HIDDEN_FROM, Study, make_trial, register_personal
 
 ROOT = Path(__file__).resolve().parents[1]
 

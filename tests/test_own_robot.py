@@ -12,8 +12,6 @@ from PIL import Image
 from tests.command import refused
 from tests.test_own_suite import DOCUMENTED
 from vap_core.base.errors import BadOutput, BadRobot, BadSuite, UnknownName
-from vap_core.evaluation.store import open_run
-from vap_core.evaluation.study import DEMO, Study
 from vap_core.policies.scripted.scripted import MOTIONS, Motion
 from vap_core.simulation import suites
 from vap_core.simulation.cameras import RIGS, Rig
@@ -21,6 +19,8 @@ from vap_core.simulation.control import Arm
 from vap_core.simulation.robots import ROBOTS, mjcf
 from vap_core.simulation.scenes import build
 from vap_core.simulation.suites import own
+from vap_core.study.store import open_run
+from vap_core.study.trials import DEMO, Study
 
 MJCF = ROBOTS["wx250s"].xml.read_text()
 ENTERS = """

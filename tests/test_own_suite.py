@@ -15,18 +15,15 @@ from gymnasium.envs import registration
 
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadSuite, UnknownName
-from vap_core.evaluation.feasibility import feasible
-from vap_core.evaluation.report.provenance import command_line, provenance
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.rescore import rescore
-from vap_core.evaluation.store import read, read_manifest
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import rollout
 from vap_core.simulation import gym_env, robots, suites
 from vap_core.simulation.suites import own
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.report import rescore
+from vap_core.study.results import command_line, load_runs, provenance
+from vap_core.study.store import read, read_manifest
+from vap_core.study.trials import Study, feasible, make_trial
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/extend.md").read_text(), re.DOTALL)

@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation import paper
-from vap_core.evaluation.paper import (
+from vap_core.simulation import suites
+from vap_core.study import paper
+from vap_core.study.paper import (
     BRIDGE,
     FOOTNOTES,
     FRACTAL,
@@ -20,7 +21,6 @@ from vap_core.evaluation.paper import (
     ledger,
     main_results,
 )
-from vap_core.simulation import suites
 
 TEX = Path(__file__).parents[2] / "shared" / "paper" / "vap-paper.tex"
 PICKS, NEARS = (

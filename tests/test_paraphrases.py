@@ -11,23 +11,25 @@ import pytest
 from tests.command import refused, vap
 from vap_core.base.errors import BadEndpoint
 from vap_core.base.types import Instruction, Target
-from vap_core.evaluation.parsers import report
-from vap_core.evaluation.parsers.measure import answer_table, measure, paraphrase_digest
-from vap_core.evaluation.parsers.paraphrases import (
+from vap_core.instruction.context import Context
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study import parsers
+from vap_core.study.parsers import (
     KINDS,
     PARTS,
     Paraphrase,
+    answer_table,
+    measure,
+    paraphrase_digest,
     paraphrases,
     read_families,
     read_vocabulary,
     suite_names,
 )
-from vap_core.instruction.context import Context
-from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import BENCHMARKS
 
 ROOT = Path(__file__).resolve().parents[1]
-PUBLISHED = ROOT / "data" / "results" / report.TABLE
+PUBLISHED = ROOT / "data" / "results" / parsers.TABLE
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +118,7 @@ def test_rates_are_counted_exactly(
     assert personal["right"].all()
     assert personal["kept"].all()
     assert not table[table["kind"] == "none"]["right"].any()
-    lines = {row[2]: row for row in report.rows(table)[1:]}
+    lines = {row[2]: row for row in parsers.rows(table)[1:]}
     n = len(table)
     assert lines["none"][5:8] == ["0 % [0, 14] [0, 41]", "0 %", "100 %"]
     assert lines["all"][4] == str(n)
@@ -139,7 +141,7 @@ def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
     done = vap("measure", "parsers", *some, "--publish", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "embedding  tune    explicit" in done.stdout
-    table = pq.read_table(tmp_path / report.TABLE)
+    table = pq.read_table(tmp_path / parsers.TABLE)
     assert table.num_rows == 18
     about = json.loads((table.schema.metadata or {})[b"about"])
     assert about["paraphrases"] == paraphrase_digest()
@@ -163,7 +165,7 @@ def test_the_page_quotes_the_published_table() -> None:
     page = (ROOT / "docs" / "instructions.md").read_text()
     table: pd.DataFrame = pq.read_table(PUBLISHED).to_pandas()
     held_out = table[table["part"] == "test"]
-    for row in report.rows(held_out)[1:]:
+    for row in parsers.rows(held_out)[1:]:
         assert (
             f"| {row[0]} | {row[2]} | {row[3]} | {row[4]} | {row[5]} | {row[6]} | {row[7]} |"
             in page

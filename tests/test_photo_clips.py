@@ -8,17 +8,19 @@ import pytest
 from PIL import Image
 
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
-from vap_core.evaluation.photos.clips import (
+from vap_core.perception.protocols import Stack
+from vap_core.study.photos import (
     FRAMES,
+    PhotoSet,
+    Scene,
+    Subject,
+    clip_report,
     follow_scene,
     frames_of,
     lies_on,
     pan_over,
     visible_share,
 )
-from vap_core.evaluation.photos.folder import PhotoSet, Scene, Subject
-from vap_core.evaluation.photos.report import clip_report
-from vap_core.perception.protocols import Stack
 
 RED, GREEN = (250, 0, 0), (0, 250, 0)
 

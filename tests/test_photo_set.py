@@ -14,23 +14,23 @@ from tests.toys import MeanColour, SameColour, detector, personal, scene, segmen
 from vap_core.attend import Attender
 from vap_core.base.errors import BadPhotoSet
 from vap_core.base.files import DATA
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.perception.estimates import clustered_share
-from vap_core.evaluation.photos import run
-from vap_core.evaluation.photos.apart import mask_rows, single_rows
-from vap_core.evaluation.photos.clips import follow_scene
-from vap_core.evaluation.photos.folder import read_photo_set
-from vap_core.evaluation.photos.measure import measure_scene
-from vap_core.evaluation.photos.pictures import fit_line, join_tiles, labelled
-from vap_core.evaluation.photos.report import (
+from vap_core.perception.protocols import Stack
+from vap_core.study import photos
+from vap_core.study.photos import (
     clustered_mean,
+    evidence,
+    follow_scene,
+    mask_rows,
+    measure_scene,
     object_rows,
+    read_photo_set,
     scene_rows,
     single_report,
+    single_rows,
     vote_rows,
 )
-from vap_core.evaluation.photos.sheet import evidence
-from vap_core.perception.protocols import Stack
+from vap_core.study.register import fit_line, join_tiles, labelled
+from vap_core.study.stats import clustered_share, rate
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
 HEADER = "scene,object,x0,y0,x1,y1\n"
@@ -59,7 +59,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "load_stack", lambda name: TOY)
+    monkeypatch.setattr(photos, "load_stack", lambda name: TOY)
 
 
 def test_the_form_is_read(folder):

@@ -11,10 +11,6 @@ from vap_core.base.errors import VapError
 from vap_core.base.files import read_file
 from vap_core.base.photos import load_photo
 from vap_core.base.video import frame_rate, frames
-from vap_core.evaluation import state_log, store
-from vap_core.evaluation.own_objects.folder import read_source
-from vap_core.evaluation.photos.folder import _read_csv
-from vap_core.evaluation.publish import read_published
 from vap_core.memory import load as load_object
 from vap_core.perception.foundation.store import read_lock
 from vap_core.policies.lerobot.checkpoints import locate
@@ -23,6 +19,10 @@ from vap_core.recording import read_summary
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.assets.scans.storage import load_scan
 from vap_core.simulation.suites import lists
+from vap_core.study import logs, store
+from vap_core.study.objects import read_source
+from vap_core.study.photos import _read_csv
+from vap_core.study.results import read_published
 from vap_make.films import dataset
 
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
@@ -37,7 +37,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "lists' hashes": ("manifest.json", lambda folder: lists.digest("a", folder)),
     "run": ("run.json", store.read_manifest),
     "episodes": ("parts/a.parquet", store.read),
-    "traces": ("traces/a.parquet", lambda folder: list(state_log.read(folder))),
+    "traces": ("traces/a.parquet", lambda folder: list(logs.read_states(folder))),
     "published": ("a.parquet", lambda folder: read_published(folder / "a.parquet")),
     "own objects": ("objects.csv", read_source),
     "boxes": ("a.csv", lambda folder: _read_csv(folder / "a.csv", ("photo",))),

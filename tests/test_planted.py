@@ -11,7 +11,6 @@ from tests.toys import TOYS, personal
 from vap_core.attend import Attender, AttendState
 from vap_core.base.errors import OutOfReach
 from vap_core.base.types import Attended
-from vap_core.evaluation.diagnosis import diagnose
 from vap_core.policies.protocol import Chunk
 from vap_core.policies.scripted.expert import (
     Expert,
@@ -31,6 +30,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene, build
 from vap_core.simulation.types import Action, EpisodeRow, Observation
+from vap_core.study.diagnosis import diagnose
 
 N = 10
 Plant = Callable[[int, EpisodeRow, Masks], Masks]

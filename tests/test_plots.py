@@ -19,12 +19,17 @@ from vap_core.analysis.plots import (
 from vap_core.attend import Attender
 from vap_core.base.figures import write_png
 from vap_core.base.palette import METHODS, SUITES, THIN_LINES
-from vap_core.evaluation.metrics import rate, score
-from vap_core.evaluation.report.failures import breakdown, funnel_table
-from vap_core.evaluation.report.funnel import cases_figure, funnel_figure
-from vap_core.evaluation.report.pictures import forest_figure, scores_table
-from vap_core.evaluation.report.result_figures import suites_figure, tasks_figure
 from vap_core.perception.boxes import mask_iou
+from vap_core.study.charts import (
+    cases_figure,
+    forest_figure,
+    funnel_figure,
+    scores_table,
+    suites_figure,
+    tasks_figure,
+)
+from vap_core.study.failures import breakdown, funnel_table
+from vap_core.study.stats import rate, score
 
 TEAL, GREY = (40, 120, 110), (90, 90, 90)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL)])

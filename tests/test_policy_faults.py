@@ -14,10 +14,6 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
-from vap_core.evaluation import engine, trials
-from vap_core.evaluation.processes import results
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
 from vap_core.policies.hooks import TEXT, report_input
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.random import Random
@@ -26,6 +22,9 @@ from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.policy_call import check_policy, checked_plan, policy_call
 from vap_core.rollout.types import Episode
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study import engine, trials
+from vap_core.study.processes import results
+from vap_core.study.trials import Study, make_trial
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
 ROWS = tuple(replace(row, max_steps=3) for row in STUDY.rows("simpler-bridge", "pick-shaver"))

@@ -14,10 +14,10 @@ import vap_core
 from vap_core import memory
 from vap_core.base import files, parquet
 from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, one_of
-from vap_core.evaluation import store
 from vap_core.instruction import history
 from vap_core.policies.mini_pi0 import token_file
 from vap_core.recording import show as viewer
+from vap_core.study import store
 
 ROOT = Path(vap_core.__file__).resolve().parent
 SOURCES = sorted(ROOT.rglob("*.py"))
@@ -104,8 +104,7 @@ def damaged(path: Path) -> Path:
 def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
     from vap_core.analysis import inspection
     from vap_core.analysis.attention import tables
-    from vap_core.evaluation import input_audit, state_log
-    from vap_core.evaluation.tokens import study
+    from vap_core.study import logs, tokens
 
     for name in tables.TABLES:
         damaged(tmp_path / f"{tables.PREFIX}{name}.parquet")
@@ -113,9 +112,9 @@ def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None
         damaged(tmp_path / f"perception_{name}.parquet")
     damaged(tmp_path / "traces" / "a.parquet")
     damaged(tmp_path / "audit" / "a.parquet")
-    damaged(tmp_path / study.TABLES[0] / "a.parquet")
+    damaged(tmp_path / tokens.TABLES[0] / "a.parquet")
     for read in (
-        tables.read, inspection.published, input_audit.read, state_log.read, study.read,
+        tables.read, inspection.published, logs.read_audit, logs.read_states, tokens.read,
     ):  # fmt: skip
         with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
             list(read(tmp_path))

@@ -14,14 +14,13 @@ from vap_core.analysis.prompt_forms import (
 )
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Camera
-from vap_core.evaluation.ablations.arms import ABLATIONS
-from vap_core.evaluation.ablations.arrow import ArrowPrompter, hand_pixel
-from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.prompt import PALETTE, Tint, has_colour, tint
 from vap_core.rollout.prompters.oracle import spoil
 from vap_core.rollout.prompters.protocol import PromptContext
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object, texture_image
+from vap_core.study.forms import ArrowPrompter, draw_arrow, hand_pixel
+from vap_core.study.methods import ABLATIONS
 
 FORMS = {
     name: arm.form for name, arm in ABLATIONS["form"].arms.items() if isinstance(arm, Prompting)
@@ -152,7 +151,7 @@ def test_every_look_alike_can_be_red_by_nature() -> None:
 
 
 def test_the_target_is_hidden_from_the_third_call_on() -> None:
-    from vap_core.evaluation.trials import _occlusion
+    from vap_core.study.trials import _occlusion
 
     occlusion = _occlusion("hidden-2", execute=4)
     assert occlusion is not None

@@ -11,12 +11,11 @@ from tests.toys import TOYS, MeanColour, personal
 from vap_core.attend import Attender
 from vap_core.base.errors import BadCrop, BadEncoder
 from vap_core.base.types import Attended, Boxes, Rgb
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters.protocol import PromptContext, checked_steps, unchanged
 from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation.types import Observation
+from vap_core.study.trials import Study, make_trial
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
 ROWS = tuple(replace(row, max_steps=3) for row in STUDY.rows("simpler-bridge", "pick-shaver"))

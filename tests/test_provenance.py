@@ -2,12 +2,9 @@
 
 from pathlib import Path
 
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.publish import read_published
-from vap_core.evaluation.report.provenance import command_line, provenance
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.study import Study
 from vap_core.simulation import suites
+from vap_core.study.results import command_line, load_runs, provenance, read_published
+from vap_core.study.trials import Study, shipped
 
 
 def test_the_command_of_a_run_is_told() -> None:

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation.publish import publish, read_runs
-from vap_core.evaluation.store import KEY, append, open_run
+from vap_core.study.results import publish, read_runs
+from vap_core.study.store import KEY, append, open_run
 
 ROW = {
     "suite": "widowx-pick",

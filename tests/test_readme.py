@@ -7,14 +7,11 @@ import pytest
 
 from tests.pages import PAGES, PROSE, table
 from tests.published import RESULTS, episodes_of, in_percent, method_of, of_way, over_layouts
-from vap_core.evaluation.diagnosis.failures import list_failures
-from vap_core.evaluation.metrics import Rate
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.report.failures import breakdown
-from vap_core.evaluation.report.results import results
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS
 from vap_core.policies.names import checkpoint_of
+from vap_core.study.failures import breakdown, list_failures
+from vap_core.study.results import load_runs, results
+from vap_core.study.stats import ALL_TASKS, Rate
+from vap_core.study.trials import shipped
 
 LIMITS = {"README.md": 1100, "CHANGELOG.md": 1500, "docs": 12_000}
 """Words at most."""

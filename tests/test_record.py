@@ -24,10 +24,10 @@ from tests.drawn import (
     rerun,
 )
 from vap_core.base.types import Association, PersonalObject, Track
-from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary, record_grounding, recording_name
 from vap_core.recording.texts import describe_vote
 from vap_core.rollout.types import EpisodeHeader, Frame
+from vap_core.study.diagnosis import explain
 
 
 def test_rerun_loads_only_when_a_recording_is_asked_for() -> None:

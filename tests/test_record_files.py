@@ -17,11 +17,11 @@ import pytest
 from tests.command import refused, vap
 from tests.drawn import SUCCESS, frame, opening, record, rerun
 from vap_core.base.errors import BadOutput, BadRecording
-from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary, recover, stream
 from vap_core.recording.entities.pictures import encode_jpeg
 from vap_core.recording.stream import LEFTOVER, temporary_path
 from vap_core.rollout.types import EpisodeHeader, Frame
+from vap_core.study.diagnosis import explain
 
 
 def test_a_killed_episode_keeps_all_flushed_steps(tmp_path: Path) -> None:

@@ -13,11 +13,11 @@ from vap_core.base import video
 from vap_core.base.errors import BadPhoto
 from vap_core.base.photos import load_photo
 from vap_core.base.types import Boxes
-from vap_core.evaluation.photos import register as registering
-from vap_core.evaluation.photos.trust import leave_one_out, warnings
 from vap_core.memory import remember
 from vap_core.perception.protocols import Stack
 from vap_core.perception.references import choose_references, whole_photos
+from vap_core.study import register as registering
+from vap_core.study.register import leave_one_out, warnings
 
 RED, GREEN, BLUE, GREY = (250, 0, 0), (0, 250, 0), (0, 0, 250), (90, 90, 90)
 STACK = Stack(

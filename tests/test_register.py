@@ -14,10 +14,9 @@ from tests.command import Done, refused, vap
 from tests.toys import TOYS, MeanColour, scene
 from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Rgb
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import register_personal
 from vap_core.memory import load, load_bank
 from vap_core.perception import stacks
+from vap_core.study.trials import Study, register_personal
 
 RED, GREEN, BLUE = (250, 0, 0), (0, 250, 0), (0, 0, 250)
 LONG = "x" * 300

@@ -20,15 +20,12 @@ from tests.command import vap
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA
 from vap_core.base.tables import markdown
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.publish import publish
-from vap_core.evaluation.report import conclude, report
-from vap_core.evaluation.report.results import errors, outcomes, results
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import ALL_TASKS, compare, rate_over_layouts
-from vap_core.evaluation.store import append, open_run
-from vap_core.evaluation.study import Study
 from vap_core.simulation import suites
+from vap_core.study.report import conclude, report
+from vap_core.study.results import errors, load_runs, outcomes, publish, results
+from vap_core.study.stats import ALL_TASKS, compare, rate, rate_over_layouts
+from vap_core.study.store import append, open_run
+from vap_core.study.trials import Study
 
 BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
 GOLDEN = Path(__file__).parent / "golden_report.md"

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from tests import browser
-from vap_core.evaluation import engine
-from vap_core.evaluation.report import report
-from vap_core.evaluation.study import Study
 from vap_core.recording import read_summary, recording_file_name
+from vap_core.study import engine
+from vap_core.study.report import report
+from vap_core.study.trials import Study
 
 pytestmark = [
     pytest.mark.sweep,

@@ -10,15 +10,13 @@ from PIL import Image
 from tests.test_report import run
 from vap_core.base import palette
 from vap_core.base.errors import BadRecording
-from vap_core.evaluation.report import page
-from vap_core.evaluation.report.failures import FunnelRow
-from vap_core.evaluation.report.funnel import funnel_figure
-from vap_core.evaluation.report.pictures import differences_figure, forest_figure
-from vap_core.evaluation.report.results import results
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.statistics import compare
 from vap_core.recording import recording_file_name
 from vap_core.simulation import suites
+from vap_core.study import report
+from vap_core.study.charts import differences_figure, forest_figure, funnel_figure
+from vap_core.study.failures import FunnelRow
+from vap_core.study.results import load_runs, results
+from vap_core.study.stats import compare
 
 
 def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
@@ -49,16 +47,16 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
     monkeypatch.setattr("vap_core.recording.read_summary", summary)
     of_b = {**row, "policy": "b"}
     path = sources[1] / "recordings" / name
-    assert list(page._recorded([of_b], sources)) == [(of_b, path)]
-    assert not list(page._recorded([{**row, "policy": "c"}], sources))
+    assert list(report._recorded([of_b], sources)) == [(of_b, path)]
+    assert not list(report._recorded([{**row, "policy": "c"}], sources))
     for other in ({**whole, "episode": 4}, {**whole, "method": "generic"}, row):
         said = other
-        assert not list(page._recorded([of_b], sources))
+        assert not list(report._recorded([of_b], sources))
 
 
 def test_a_card_gives_a_command_for_a_shell(tmp_path: Path) -> None:
     row = dict.fromkeys(("suite", "task", "method", "case", "sub_case", "case_sentence"), "a")
-    card = page._card({**row, "episode": 1, "deciding_frame": 2}, tmp_path / "a b.rrd", tmp_path)
+    card = report._card({**row, "episode": 1, "deciding_frame": 2}, tmp_path / "a b.rrd", tmp_path)
     assert f"view &#x27;{tmp_path}/a b.rrd&#x27; --frame 2" in card
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vap_core.evaluation import state_log as traces
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame
 from vap_core.simulation.suites.rules import Judge, _lowest_m, _middle, rejudge
 from vap_core.simulation.types import REST, ROBOT, EpisodeRow, Placement, Truth
+from vap_core.study import logs as traces
 
 TARGET, OTHER, GOAL = "cup-personal", "cup-lookalike-1", "plate-prop"
 SIZES = {TARGET: (0.04, 0.03, 0.07), OTHER: (0.04, 0.03, 0.07), GOAL: (0.12, 0.09, 0.012)}
@@ -323,8 +323,8 @@ def test_a_saved_episode_is_judged_alike(tmp_path):
     )
     judge = rejudge(PUT, SIZES, steps)
     opening = EpisodeHeader(PUT, "vap", "scripted", 5.0, (), "", "", {}, SIZES)
-    traces.write(tmp_path, [Episode(opening, frames, judge.outcome(), {})])
-    ((key, saved),) = traces.read(tmp_path)
+    traces.write_states(tmp_path, [Episode(opening, frames, judge.outcome(), {})])
+    ((key, saved),) = traces.read_states(tmp_path)
     assert key == ("s", "t", "vap", 0, 0)
     again = rejudge(PUT, SIZES, saved)
     assert repr(again.outcome()) == repr(judge.outcome())

@@ -15,11 +15,9 @@ from hypothesis import strategies as st
 
 from tests.test_report import run
 from vap_core.base.errors import BadOutput, VapError
-from vap_core.evaluation.diagnosis.failures import list_failures
-from vap_core.evaluation.diagnosis.recordings import study_of
-from vap_core.evaluation.publish import publish, read_runs
-from vap_core.evaluation.report import report
-from vap_core.evaluation.run_schema import check_run
+from vap_core.study.failures import list_failures, study_of
+from vap_core.study.report import report
+from vap_core.study.results import check_run, publish, read_runs
 
 JUNK: list[Any] = [None, -1, 10**30, 1.5, True, "", "nowhere", [], [1], {}, {"a": [None]}]
 NOTES = ("tasks", "methods", "episodes", "seed", "seeds", "policy", "lists", "stack")

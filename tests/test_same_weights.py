@@ -7,12 +7,9 @@ from pathlib import Path
 import pytest
 
 from vap_core.base.errors import BadPolicy
-from vap_core.evaluation.engine import missing_jobs
-from vap_core.evaluation.store import open_run
-from vap_core.evaluation.jobs import run_job
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.same_weights import require_same_weights
-from vap_core.evaluation.study import Study
+from vap_core.study.engine import missing_jobs, require_same_weights, run_job
+from vap_core.study.store import open_run
+from vap_core.study.trials import Study, shipped
 
 SUITE = "simpler-bridge"
 TASKS = ((SUITE, "pick-shaver"),)

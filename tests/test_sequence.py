@@ -9,8 +9,6 @@ import pytest
 
 from tests.drawn import columns
 from vap_core.base.errors import BadInstruction
-from vap_core.evaluation import diagnosis
-from vap_core.evaluation.report.failures import breakdown, breakdown_rows
 from vap_core.instruction.sequence import decompose
 from vap_core.policies.scripted.expert import Expert
 from vap_core.recording import Recorder
@@ -21,6 +19,8 @@ from vap_core.simulation import homing
 from vap_core.simulation.suites import lists
 from vap_core.simulation.suites.open_row import build_scene, open_row
 from vap_core.simulation.types import Outcome, of_subgoals
+from vap_core.study import diagnosis
+from vap_core.study.failures import breakdown, breakdown_rows
 
 DONE = Outcome("success", True, True, 5, True, False, True, 30)
 MISSED = Outcome("failure", False, False, 0, False, True, False, 60)

@@ -11,10 +11,6 @@ import pytest
 from vap_core.base.errors import BadInstruction, BadStudy, BadSuite, UnknownName
 from vap_core.base.files import DATA
 from vap_core.base.types import PersonalObject
-from vap_core.evaluation.engine import result_key
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.report import suites_table
-from vap_core.evaluation.study import Study
 from vap_core.instruction.parsers import rule_parser
 from vap_core.instruction.sequence import decompose
 from vap_core.memory import recall
@@ -24,6 +20,9 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import SHARED, lists, shared
 from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.types import Owned
+from vap_core.study.engine import result_key
+from vap_core.study.report import suites_table
+from vap_core.study.trials import Study, shipped
 
 
 def memory(row):

@@ -9,12 +9,12 @@ from tests.pages import ROOT
 from vap_core.analysis import shared_films, shared_scenes
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA, SHIPPED
-from vap_core.evaluation.paper import ledger
-from vap_core.evaluation.parsers import report
-from vap_core.evaluation.publish import read_runs
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.names import checkpoint_of, policy_label, shipped_checkpoint
 from vap_core.prompt import PALETTE
+from vap_core.study import parsers
+from vap_core.study.paper import ledger
+from vap_core.study.results import read_runs
 from vap_make.recipe import RECIPES
 
 SUITE = "shared-sequence-bridge"
@@ -106,7 +106,7 @@ def test_parsers_are_as_the_command_prints_them():
     answers = pd.read_parquet(DATA / "results" / "parsers.parquet")
     answers = answers[answers["part"] == "test"]
     ours = shared_scenes.parser_table(answers)
-    printed = report.rows(answers)[1:]
+    printed = parsers.rows(answers)[1:]
     assert len(printed) == len(ours)
     for line, cells in zip(ours.to_dict("records"), printed, strict=True):
         assert [line["parser"], line["kind"], str(line["n"])] == [cells[0], cells[2], cells[4]]

@@ -11,10 +11,6 @@ from lerobot.policies import make_pre_post_processors
 
 from vap_core.base.errors import BadMemory, BadStudy
 from vap_core.contracts import test_suite
-from vap_core.evaluation import engine, trials
-from vap_core.evaluation.jobs import run_job
-from vap_core.evaluation.methods import make_prompter
-from vap_core.evaluation.study import Study
 from vap_core.policies.lerobot.checkpoints import config_field
 from vap_core.policies.mini_pi0 import learned_token, teach_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
@@ -29,6 +25,10 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, wording
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.suite import Task
+from vap_core.study import engine, trials
+from vap_core.study.engine import run_job
+from vap_core.study.methods import make_prompter
+from vap_core.study.trials import Study
 from vap_make.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7
@@ -153,7 +153,7 @@ def test_one_object_has_a_token_for_every_model_and_its_look_alikes(
         grow(home, far, seed)
     policies = {SUITE: MODEL, "widowx-pick": f"{MODEL}-other", "franka-pick": MODEL}
     monkeypatch.setattr(
-        "vap_core.evaluation.study.shipped", lambda suite: tmp_path / f"policy-{policies[suite]}"
+        "vap_core.study.trials.shipped", lambda suite: tmp_path / f"policy-{policies[suite]}"
     )
     monkeypatch.setattr(teach_token, "MODEL", tmp_path / MODEL)
     monkeypatch.setattr(teach_token, "VIEWS", 2)

@@ -6,13 +6,11 @@ from pathlib import Path
 import pytest
 
 from vap_core.base.errors import BadStudy
-from vap_core.evaluation.engine import run
-from vap_core.evaluation.publish import publish, read_runs
-from vap_core.evaluation.report.results import results
-from vap_core.evaluation.report.runs import load_runs
-from vap_core.evaluation.rescore import rescore
-from vap_core.evaluation.study import Study
 from vap_core.simulation import suites
+from vap_core.study.engine import run
+from vap_core.study.report import rescore
+from vap_core.study.results import load_runs, publish, read_runs, results
+from vap_core.study.trials import Study
 
 SUITE = "simpler-fractal"
 TASKS = tuple((SUITE, task.name) for task in suites.suite(SUITE).tasks)

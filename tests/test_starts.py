@@ -11,14 +11,14 @@ import pytest
 from tests.test_lists import gap_m
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA
-from vap_core.evaluation.diagnosis.recordings import study_of
-from vap_core.evaluation.engine import result_key
-from vap_core.evaluation.publish import read_published
-from vap_core.evaluation.study import Study
 from vap_core.simulation import robots, suites
 from vap_core.simulation.suites import BENCHMARKS, SHARED, starts
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import AS_LISTED, EpisodeRow, Placement, Start
+from vap_core.study.engine import result_key
+from vap_core.study.failures import study_of
+from vap_core.study.results import read_published
+from vap_core.study.trials import Study
 
 LEAST_GAP_M = 0.01
 RECEPTACLES = {"plate-prop", "basket-prop"}

@@ -11,22 +11,21 @@ from hypothesis import strategies as st
 from scipy.stats import norm, permutation_test
 from statsmodels.stats.multitest import multipletests
 
-from vap_core.evaluation.layouts import layout_name, layout_names
-from vap_core.evaluation.power import (
-    detectable_effect_text,
-    minimum_detectable_effect,
-    power,
-)
-from vap_core.evaluation.statistics import (
+from vap_core.simulation import suites
+from vap_core.study.stats import (
     ALL_TASKS,
     Comparison,
     bootstrap_interval,
     compare,
+    detectable_effect_text,
     holm,
+    layout_name,
+    layout_names,
     mcnemar,
+    minimum_detectable_effect,
+    power,
     sign_flip,
 )
-from vap_core.simulation import suites
 
 
 def test_mcnemar_by_hand() -> None:

@@ -9,8 +9,8 @@ import pytest
 from tests.command import refused, vap
 from tests.drawn import SUCCESS, frame, opening
 from vap_core.base.errors import BadRecording, BadStudy, UnknownName, VapError
-from vap_core.evaluation import corrections, diagnosis, steps, store
 from vap_core.rollout.types import Episode
+from vap_core.study import diagnosis, failures, steps, store
 
 FAILURE = replace(SUCCESS, status="failure", success=False, success_once=False)
 
@@ -73,9 +73,9 @@ def test_a_condition_finds_episodes_and_sql_finds_anything(run: Path) -> None:
 def test_a_correction_counts_in_a_query(run: Path) -> None:
     _, episodes = steps.read(run)
     rows = episodes.to_dict("records")
-    file = corrections.correct(run, rows[1], "case 3: slip", "it held, a moment")
-    corrections.correct(run, rows[1], "case 1: drift")
-    corrections.correct(run, rows[1], "case 3: slip", "it held, a moment")
+    file = failures.correct(run, rows[1], "case 3: slip", "it held, a moment")
+    failures.correct(run, rows[1], "case 1: drift")
+    failures.correct(run, rows[1], "case 3: slip", "it held, a moment")
     asked = "select sub_case, case_sentence from episodes where corrected"
     assert steps.query(run, asked).values.tolist() == [["slip", "it held, a moment"]]
     file.unlink()
@@ -105,8 +105,8 @@ def test_what_cannot_be_opened_is_refused(run: Path, tmp_path: Path) -> None:
             run, steps.query(run, "select 1 as one from steps"), 0
         ),
         "has no step rows; name the folder": lambda: steps.read(tmp_path),
-        "only failures have a case": lambda: corrections.correct(run, rows[0], "case 3: slip"),
-        "case 'case 4' is unknown": lambda: corrections.correct(run, rows[1], "case 4: slip"),
+        "only failures have a case": lambda: failures.correct(run, rows[0], "case 3: slip"),
+        "case 'case 4' is unknown": lambda: failures.correct(run, rows[1], "case 4: slip"),
     }
     for said, call in calls.items():
         with pytest.raises(VapError, match=said) as caught:

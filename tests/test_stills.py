@@ -11,8 +11,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from vap_core.analysis.plots import keep_png
 from vap_core.base.errors import BadOutput
-from vap_core.evaluation import stills
-from vap_core.evaluation.study import Study
+from vap_core.study import failures
+from vap_core.study.trials import Study
 
 FIGURES = Path(__file__).parents[1] / "figures"
 COMMITTED = {
@@ -29,18 +29,18 @@ STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("vap",), episodes=1)
 def still(tmp_path: Path) -> Path:
     path = tmp_path / "still.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)
-    stills.write_provenance(path, STUDY)
+    failures.write_provenance(path, STUDY)
     return path
 
 
 def test_every_committed_still_shows_what_ships() -> None:
-    about = {path.name: stills.read_provenance(path) for path in FIGURES.glob("*.png")}
+    about = {path.name: failures.read_provenance(path) for path in FIGURES.glob("*.png")}
     assert {name for name, provenance in about.items() if provenance} == COMMITTED
     for name in COMMITTED:
         assert not Path(about[name]["study"]["policy"]).is_absolute(), (
             f"{name} names a folder of one machine: take the picture with a policy that ships"
         )
-    differences = {name: stills.stale(FIGURES / name) for name in sorted(COMMITTED)}
+    differences = {name: failures.stale(FIGURES / name) for name in sorted(COMMITTED)}
     assert not any(differences.values()), (
         f"{differences}; set RECOMPUTE in the notebook and execute it again"
     )
@@ -49,18 +49,18 @@ def test_every_committed_still_shows_what_ships() -> None:
 def test_another_world_or_recorder_makes_a_still_stale(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert stills.stale(still) == ""
+    assert failures.stale(still) == ""
     with monkeypatch.context() as patch:
-        patch.setattr(stills, "recorder_digest", lambda: "another")
-        assert "recorder" in stills.stale(still)
+        patch.setattr(failures, "recorder_digest", lambda: "another")
+        assert "recorder" in failures.stale(still)
     monkeypatch.setattr(Study, "configuration", lambda study: {"weights": "another"})
-    assert "weights" in stills.stale(still)
+    assert "weights" in failures.stale(still)
 
 
 def test_a_smaller_copy_keeps_what_it_shows(still: Path) -> None:
-    before = stills.read_provenance(still)
+    before = failures.read_provenance(still)
     jpeg = keep_png(still.read_bytes(), still)
-    assert stills.read_provenance(still) == before
+    assert failures.read_provenance(still) == before
     assert Image.open(BytesIO(jpeg)).format == "JPEG"
 
 
@@ -68,20 +68,20 @@ def test_a_picture_that_says_nothing_is_named(tmp_path: Path) -> None:
     path = tmp_path / "plain.png"
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)
     with pytest.raises(BadOutput, match="does not say what it shows; take the picture again"):
-        stills.stale(path)
+        failures.stale(path)
     path.write_bytes(b"no picture")
     with pytest.raises(BadOutput, match="is no PNG"):
-        stills.write_provenance(path, STUDY)
+        failures.write_provenance(path, STUDY)
 
 
 def test_no_file_is_executed_that_a_picture_names(still: Path, tmp_path: Path) -> None:
     marker, code = tmp_path / "executed", tmp_path / "code.py"
     code.write_text(f"open({str(marker)!r}, 'w')\n")
-    about = stills.read_provenance(still)
+    about = failures.read_provenance(still)
     about["study"]["suite_files"] = [str(code)]
     info = PngInfo()
-    info.add_text(stills.KEY, json.dumps(about))
+    info.add_text(failures.CHUNK, json.dumps(about))
     with Image.open(still) as picture:
         picture.save(still, pnginfo=info)
-    assert stills.stale(still) == ""
+    assert failures.stale(still) == ""
     assert not marker.exists()

@@ -11,17 +11,8 @@ import pytest
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import write_atomic
-from vap_core.evaluation import store
-from vap_core.evaluation.store import (
-    KEY,
-    append,
-    compact,
-    digest,
-    locked,
-    open_run,
-    read,
-    read_manifest,
-)
+from vap_core.study import store
+from vap_core.study.store import KEY, append, compact, digest, locked, open_run, read, read_manifest
 
 ROW = {
     "suite": "s",

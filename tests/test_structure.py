@@ -25,7 +25,7 @@ LAYERS = (
     ("policies",),
     ("rollout",),
     ("recording",),
-    ("evaluation",),
+    ("study",),
     ("contracts",),
     ("analysis",),
     ("cli",),

@@ -11,22 +11,24 @@ from hypothesis import strategies as st
 from tests.toys import TOYS, personal, scene
 from vap_core.associate import PAIRINGS
 from vap_core.base.types import Boxes, PersonalObject, Rgb
-from vap_core.evaluation.perception.episodes import OFF, agreements, survey
-from vap_core.evaluation.perception.first_frames import (
-    RULES,
-    Tables,
-    View,
-    find_candidates,
-    match,
-    opening_views,
-    registered_object,
-)
-from vap_core.evaluation.perception.first_frames import survey_view as survey_one
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.types import EpisodeRow, Placement
+from vap_core.study.perception import (
+    OFF,
+    RULES,
+    Tables,
+    View,
+    agreements,
+    find_candidates,
+    match,
+    opening_views,
+    registered_object,
+    survey,
+)
+from vap_core.study.perception import survey_view as survey_one
 
 RED, GREEN, BLUE = (250, 5, 5), (5, 250, 5), (5, 5, 250)
 MINE, HARD, EASY = "cup-personal", "cup-lookalike-3", "cup-lookalike-6"

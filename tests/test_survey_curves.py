@@ -7,11 +7,10 @@ import pandas as pd
 import pytest
 
 from vap_core.base.figures import write_png
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.perception import curves
-from vap_core.evaluation.perception.episodes import OFF
-from vap_core.evaluation.perception.first_frames import KS, RULES
-from vap_core.evaluation.perception.report import measures, report
+from vap_core.study import charts
+from vap_core.study.perception import KS, OFF, RULES
+from vap_core.study.stats import rate
+from vap_core.study.survey import measures, report
 
 SUITES = {
     "vlabench": ("select-shoe", ("front", "side")),
@@ -151,15 +150,15 @@ def test_the_report_tells_every_part() -> None:
 
 
 def test_abstention_covers_more_and_more_and_never_a_view_without_candidates() -> None:
-    curve = curves.abstention(tables()["choices"], "cosine_margin")
+    curve = charts.abstention(tables()["choices"], "cosine_margin")
     assert curve.threshold.is_monotonic_decreasing
     assert curve.coverage.tolist() == pytest.approx([i / 9 for i in range(1, 9)])
     assert (curve.n.iloc[-1], curve.right.iloc[-1]) == (8, pytest.approx(4 / 8))
-    assert len(curves.abstention(tables()["choices"], "margin")) == 3
+    assert len(charts.abstention(tables()["choices"], "margin")) == 3
 
 
 def test_lookalike_pairs_match_a_look_alike_with_the_target_beside_it() -> None:
-    found = curves.lookalike_pairs(tables()["objects"])
+    found = charts.lookalike_pairs(tables()["objects"])
     assert len(found) == 9
     assert sorted(found.ahead.round(6).unique()) == [-0.1, 0.3]
     assert (found.ahead < 0).sum() == 1
@@ -167,8 +166,8 @@ def test_lookalike_pairs_match_a_look_alike_with_the_target_beside_it() -> None:
 
 @pytest.mark.parametrize(
     ("draw", "table", "axes"),
-    [(curves.abstention_figure, "choices", 1), (curves.hardness_figure, "objects", 2), (curves.references_figure, "choices", 3),
-     (curves.time_figure, "tracks", 1), (curves.hidden_figure, "tracks", 1)],
+    [(charts.abstention_figure, "choices", 1), (charts.hardness_figure, "objects", 2), (charts.references_figure, "choices", 3),
+     (charts.time_figure, "tracks", 1), (charts.hidden_figure, "tracks", 1)],
 )  # fmt: skip
 def test_figures_draw(draw, table: str, axes: int, tmp_path: Path) -> None:
     figure = draw(tables()[table])
@@ -178,17 +177,17 @@ def test_figures_draw(draw, table: str, axes: int, tmp_path: Path) -> None:
 
 
 def test_time_and_hidden_figures_show_the_numbers() -> None:
-    lines = curves.time_figure(tables()["tracks"]).axes[0].lines
+    lines = charts.time_figure(tables()["tracks"]).axes[0].lines
     assert [line.get_label() for line in lines[:2]] == [
         "simpler-bridge, 4 tracks",
         "vlabench, 8 tracks",
     ]
     assert lines[0].get_ydata()[1:].tolist() == [1.0, 0.5]
     assert np.isnan(lines[0].get_ydata()[0])
-    lost = curves.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
+    lost = charts.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
     assert lost.get_ydata().tolist() == [50.0, 50.0]
     tracks = tables()["tracks"]
     arm = tracks[tracks.hidden > 0].assign(kind="arm").iloc[:3]
     n = int(arm.target.sum())
-    axes = curves.hidden_figure(pd.concat([tracks, arm], ignore_index=True)).axes[0]
+    axes = charts.hidden_figure(pd.concat([tracks, arm], ignore_index=True)).axes[0]
     assert axes.get_legend_handles_labels()[1][1] == f"an arm moves in front (n = {n})"

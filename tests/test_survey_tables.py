@@ -13,20 +13,19 @@ from pyarrow.parquet import read_schema
 
 from tests.command import vap
 from vap_core.base.errors import BadOutput, UnknownName
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.perception import run, tracking
-from vap_core.evaluation.perception.estimates import (
+from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study import survey, tracking
+from vap_core.study.stats import (
     NONE,
     Estimate,
     average_precision,
     mean,
     precision,
+    rate,
     share,
     share_by,
 )
-from vap_core.evaluation.perception.report import ALL, Measure
-from vap_core.evaluation.perception.run import Survey, plan, publish, read
-from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study.survey import ALL, Measure, Survey, plan, publish, read
 
 MARKS = st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=12)
 
@@ -157,7 +156,7 @@ def test_the_plan_is_the_same_every_time_and_every_part_has_its_own_name() -> No
     assert [job.name for job in jobs] == [job.name for job in plan(Survey())]
     assert len({job.name for job in jobs}) == len(jobs)
     opened = [row.key for job in jobs if not isinstance(job.what, tracking.Job) for row in job.what]
-    wanted = sum(n * len(BENCHMARKS[suite].tasks) for suite, n in run.EPISODES.items())
+    wanted = sum(n * len(BENCHMARKS[suite].tasks) for suite, n in survey.EPISODES.items())
     assert len(opened) == len(set(opened)) == wanted > 200
     assert [isinstance(job.what, tracking.Job) for job in jobs] == sorted(
         (isinstance(job.what, tracking.Job) for job in jobs), reverse=True
@@ -176,7 +175,7 @@ def test_unknown_names_are_refused() -> None:
 def test_a_folder_that_is_no_finished_survey_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadOutput, match=r"run\.json is absent"):
         read(tmp_path)
-    run.store.open_run(tmp_path / "begun", Survey(suites=("simpler-bridge",)).configuration())
+    survey.store.open_run(tmp_path / "begun", Survey(suites=("simpler-bridge",)).configuration())
     with pytest.raises(BadOutput, match="lacks views, .* run the same measure perception again"):
         publish(tmp_path / "begun", tmp_path)
 
@@ -234,13 +233,13 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     }
     lost.unlink()
     asked = Survey(suites=("simpler-fractal",), episodes=1, quick=True)
-    again = run.run_survey(asked, out, jobs=1, progress=False)
+    again = survey.run_survey(asked, out, jobs=1, progress=False)
     assert {
         part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
     } == kept
-    assert all(tables[name].equals(again[name]) for name in run.TABLES)
+    assert all(tables[name].equals(again[name]) for name in survey.TABLES)
     lost.write_text("{")
     with pytest.raises(BadOutput, match="is damaged; delete it and run the same command again"):
-        run.run_survey(asked, out, jobs=1, progress=False)
+        survey.run_survey(asked, out, jobs=1, progress=False)
     with pytest.raises(BadOutput, match="holds another run"):
-        run.run_survey(replace(asked, suites=("tabletop",)), out, jobs=1, progress=False)
+        survey.run_survey(replace(asked, suites=("tabletop",)), out, jobs=1, progress=False)

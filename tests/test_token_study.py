@@ -17,18 +17,16 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, Unkn
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.cli import app
-from vap_core.evaluation import engine, trials
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.tokens import choices, report, study
-from vap_core.evaluation.tokens.choices import Scene
-from vap_core.evaluation.tokens.study import OTHER, Job, Tokens, plan
 from vap_core.policies.embedding_table import open_table
 from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignment, token_file
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel
+from vap_core.study import engine, tokens, trials
+from vap_core.study.stats import rate
+from vap_core.study.tokens import OTHER, Job, Scene, Tokens, plan
+from vap_core.study.trials import Study
 
 from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
 
@@ -43,7 +41,7 @@ def tiny(
     monkeypatch.setattr(teach_token, "MODEL", home)
     monkeypatch.setattr(teach_token, "VIEWS", 2)
     monkeypatch.setattr(teach_token, "OTHERS", 1)
-    monkeypatch.setattr(study, "shipped", lambda suite: far)
+    monkeypatch.setattr(tokens, "shipped", lambda suite: far)
 
     def views(model: ObjectModel, n: int = 5, seed: int = 0) -> list[Rgb]:
         """Noise of the object's own: rendering takes longer than all that is tested."""
@@ -71,13 +69,13 @@ def tiny(
         }
         return tuple(Scene(episode=i, target=target, crops=crops) for i in range(2))
 
-    monkeypatch.setattr(study, "TokenTraining", training)
-    monkeypatch.setattr(study, "results", in_this_process)
-    monkeypatch.setattr(choices, "scenes", scenes)
-    for cached in (study._model, study._policy_model, study._negatives):
+    monkeypatch.setattr(tokens, "TokenTraining", training)
+    monkeypatch.setattr(tokens, "results", in_this_process)
+    monkeypatch.setattr(tokens, "scenes", scenes)
+    for cached in (tokens._model, tokens._policy_model, tokens._negatives):
         cached.cache_clear()
     yield grown
-    for cached in (study._model, study._policy_model, study._negatives):
+    for cached in (tokens._model, tokens._policy_model, tokens._negatives):
         cached.cache_clear()
 
 
@@ -142,18 +140,18 @@ def test_tokens_of_other_spaces_are_methods(
 def test_the_study_measures_every_token_and_goes_on(
     tiny: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study, "plan", lambda asked: plan(asked)[:2])
+    monkeypatch.setattr(tokens, "plan", lambda asked: plan(asked)[:2])
     asked = Tokens((SUITE,), (5,), epochs=2)
-    tables = study.run(asked, tmp_path / "run", progress=False)
+    tables = tokens.run(asked, tmp_path / "run", progress=False)
     answers = tables["answers"]
     assert set(answers.groupby(["learned_in", "token", "read_by"]).groups) == set(
-        report.READINGS.values()
+        tokens.READINGS.values()
     )
     assert set(answers[answers.learned_in == "policy"].step) == {0, 1, 2}
     own = answers[answers.shown == answers.object]
     assert (own.n == 2).all()
     assert OTHER in set(answers.shown)
-    (kinds, counts) = np.unique(report.kind_of(answers), return_counts=True)
+    (kinds, counts) = np.unique(tokens.kind_of(answers), return_counts=True)
     assert list(kinds) == ["look-alikes", "other objects", "own"]
     assert counts[0] == 6 * counts[1]
     scored = tables["choices"]
@@ -172,27 +170,27 @@ def test_the_study_measures_every_token_and_goes_on(
     def must_not_run(job: Job) -> None:
         raise AssertionError(job)
 
-    run_job = study.run_job
-    monkeypatch.setattr(study, "run_job", must_not_run)
-    again = study.run(asked, tmp_path / "run", progress=False)
+    run_job = tokens.run_job
+    monkeypatch.setattr(tokens, "run_job", must_not_run)
+    again = tokens.run(asked, tmp_path / "run", progress=False)
     assert again["answers"].equals(answers)
-    monkeypatch.setattr(study, "run_job", run_job)
+    monkeypatch.setattr(tokens, "run_job", run_job)
     next((tmp_path / "run" / "answers").glob("*.parquet")).unlink()
-    mended = study.run(asked, tmp_path / "run", progress=False)
+    mended = tokens.run(asked, tmp_path / "run", progress=False)
     assert mended["answers"].equals(answers), "a part that was deleted is made again"
-    other = study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
+    other = tokens.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
     for _ in range(2):
-        for path in study.publish(tmp_path / "run", tmp_path / "kept"):
+        for path in tokens.publish(tmp_path / "run", tmp_path / "kept"):
             assert len(pd.read_parquet(path)) == len(tables[path.stem.removeprefix("token_")])
-    for path in study.publish(tmp_path / "other", tmp_path / "kept"):
+    for path in tokens.publish(tmp_path / "other", tmp_path / "kept"):
         name = path.stem.removeprefix("token_")
         assert len(pd.read_parquet(path)) == len(tables[name]) + len(other[name])
         runs = json.loads(pq.read_schema(path).metadata[b"runs"])
         assert [run["configuration"]["epochs"] for run in runs] == [2, 1]
     with pytest.raises(BadOutput):
-        study.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
-    assert "learned in the policy" in report.report(tables)
-    assert "the model chooses the target" in report.report(tables)
+        tokens.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
+    assert "learned in the policy" in tokens.report(tables)
+    assert "the model chooses the target" in tokens.report(tables)
 
 
 def test_a_job_whose_parts_are_not_named_is_not_done(tmp_path: Path) -> None:
@@ -201,26 +199,26 @@ def test_a_job_whose_parts_are_not_named_is_not_done(tmp_path: Path) -> None:
     done = tmp_path / "done" / job.name
     done.parent.mkdir()
     done.write_text("")
-    assert not study._is_done(tmp_path, job)
+    assert not tokens._is_done(tmp_path, job)
     (tmp_path / "part").touch()
     done.write_text("part\n")
-    assert study._is_done(tmp_path, job)
+    assert tokens._is_done(tmp_path, job)
 
 
 def test_a_disk_that_is_full_ends_the_study_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     jobs = plan(Tokens((SUITE,), (5,), epochs=2))[:1]
-    monkeypatch.setattr(study, "plan", lambda asked: jobs)
+    monkeypatch.setattr(tokens, "plan", lambda asked: jobs)
     monkeypatch.setattr(Tokens, "configuration", lambda asked: {"survey": "tokens"})
-    study.store.open_run(tmp_path / "run", {"survey": "tokens"})
+    tokens.store.open_run(tmp_path / "run", {"survey": "tokens"})
     (tmp_path / "run" / "done").mkdir()
-    monkeypatch.setattr(study, "results", lambda *_, **__: [(jobs[0], {"answers": [{"n": 1}]})])
+    monkeypatch.setattr(tokens, "results", lambda *_, **__: [(jobs[0], {"answers": [{"n": 1}]})])
     monkeypatch.setattr(
-        study.store, "write_part", lambda folder, *_, **__: folder / "answers" / "part"
+        tokens.store, "write_part", lambda folder, *_, **__: folder / "answers" / "part"
     )
     with pytest.raises(BadOutput, match="^measure tokens: .* cannot be written"), full_disk():
-        study.run(Tokens((SUITE,), (5,), epochs=2), tmp_path / "run", progress=False)
+        tokens.run(Tokens((SUITE,), (5,), epochs=2), tmp_path / "run", progress=False)
     assert not list((tmp_path / "run" / "done").iterdir())
 
 
@@ -230,7 +228,7 @@ def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None
     assert len(jobs) == 4 * 3
     assert {job.where for job in plan(Tokens((SUITE,), places=("vlm",)))} == {"vlm"}
     with pytest.raises(BadStudy, match="from 5 photos alone"):
-        study.run(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
+        tokens.run(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
     with pytest.raises(UnknownName, match="measure tokens: --learn-in"):
         Tokens((SUITE,), places=("here",))
     with pytest.raises(UnknownName, match="measure tokens: suite"):
@@ -247,23 +245,23 @@ def test_rates_are_counted_by_hand() -> None:
             lines.append(("s", "t", "cup", 5, "vlm", step, "as learned", "vlm", shown, yes, n))
     columns = ["suite", "task", "object", "k", "learned_in", "step", "token", "read_by"]
     answers = pd.DataFrame(lines, columns=[*columns, "shown", "yes", "n"])
-    (line,) = report.readings(answers).to_dict("records")
+    (line,) = tokens.readings(answers).to_dict("records")
     assert line["right"] == pytest.approx((3 / 4 + 5 / 6) / 2)
     assert (line["own"].k, line["look-alikes"].k, line["other objects"].k) == (3, 1, 0)
-    whole = report.pooled(answers).loc["as learned"]
+    whole = tokens.pooled(answers).loc["as learned"]
     assert whole["own"].text() == "75.0 [30.1, 95.4] 4"
     assert (whole["right"].n, whole["right"].value) == (1, line["right"])
     assert np.isnan(whole["right"].low)
     other = answers.assign(object="mug", shown=answers.shown.str.replace("cup", "mug"), yes=0)
-    both = report.pooled(pd.concat([answers, other])).loc["as learned"]
+    both = tokens.pooled(pd.concat([answers, other])).loc["as learned"]
     assert (both["own"].value, both["own"].n) == (3 / 8, 8)
     rights = [line["right"], 0.5]
     interval = stats.t.interval(0.95, 1, np.mean(rights), stats.sem(rights))
     assert (both["right"].n, both["right"].value) == (2, pytest.approx(np.mean(rights)))
     assert (both["right"].low, both["right"].high) == (max(0, interval[0]), min(1, interval[1]))
-    (taken,) = report.confusions(answers).to_dict("records")
+    (taken,) = tokens.confusions(answers).to_dict("records")
     assert (taken["look-alike"], taken["yes"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
-    curve = report.curve(answers).set_index(["step", "kind"]).yes
+    curve = tokens.curve(answers).set_index(["step", "kind"]).yes
     assert (curve[0, "own"], curve[9, "own"]) == (0, 0.75)
 
 
@@ -271,13 +269,13 @@ def test_a_crop_shows_the_object_as_a_photo_does() -> None:
     rgb = np.zeros((100, 100, 3), np.uint8)
     rgb[80:100, 90:100] = 200
     mask = rgb[..., 0] > 0
-    crop = choices.photo_crop(rgb, mask)
+    crop = tokens.photo_crop(rgb, mask)
     assert crop is not None
     assert crop.shape == (36, 36, 3)
     assert (crop[18, 18] == 200).all()
     assert (crop[0, 0] == 0).all()
     assert (crop[-1, -1] == 200).all(), "the edge of the view is repeated"
-    assert choices.photo_crop(rgb, np.zeros_like(mask)) is None
+    assert tokens.photo_crop(rgb, np.zeros_like(mask)) is None
 
 
 def test_photos_take_the_place_of_crops() -> None:
@@ -285,7 +283,7 @@ def test_photos_take_the_place_of_crops() -> None:
     crops = {"cup": tuple(rng.integers(0, 256, (2, 4, 4, 3)).astype(np.uint8))}
     scenes = [Scene(episode=episode, target="cup", crops=crops) for episode in (3, 7)]
     photos = {"cup": tuple(rng.integers(0, 256, (3, 4, 4, 3)).astype(np.uint8)), OTHER: ()}
-    found = choices.in_photos(scenes, photos)
+    found = tokens.in_photos(scenes, photos)
     assert [scene.episode for scene in found] == [3, 7]
     for scene, taken in zip(found, ((0, 1), (2, 0)), strict=True):
         for picture, i in zip(scene.crops["cup"], taken, strict=True):
@@ -299,35 +297,35 @@ def test_the_highest_score_is_the_choice() -> None:
             lines.append(("s", "t", episode, "cup", name, score))
     lines.append(("s", "t", 2, "cup", "cup-lookalike-1", 1.0))
     table = pd.DataFrame(lines, columns=["suite", "task", "episode", "object", "shown", "score"])
-    found = choices.chosen(table)
+    found = tokens.chosen(table)
     assert list(found.right) == [True, False, False]
     assert list(found.chance) == pytest.approx([1 / 3, 1 / 3, 0])
-    even = choices.chosen(table.assign(score=1.0))
+    even = tokens.chosen(table.assign(score=1.0))
     assert not even.right.any(), "a tie is no choice"
     rows = [("s", "t", i, m, i == 0) for i in range(3) for m in ("soft", "generic")]
     columns = ["suite", "task", "episode", "method", "first_object_correct"]
     both = pd.concat([table.assign(seen_in="scene"), table.assign(seen_in="photo", score=1.0)])
-    beside = choices.beside_policy(both, pd.DataFrame(rows, columns=columns), ["soft", "generic"])
+    beside = tokens.beside_policy(both, pd.DataFrame(rows, columns=columns), ["soft", "generic"])
     line = beside.loc["s"]
-    assert (line[choices.IN_SCENE].value, line[choices.IN_SCENE].n) == (pytest.approx(1 / 3), 3)
-    assert (line[choices.IN_PHOTOS].value, line["soft"].value) == (0, pytest.approx(1 / 3))
-    after = (line[choices.AFTER_RIGHT], line[choices.AFTER_WRONG])
+    assert (line[tokens.IN_SCENE].value, line[tokens.IN_SCENE].n) == (pytest.approx(1 / 3), 3)
+    assert (line[tokens.IN_PHOTOS].value, line["soft"].value) == (0, pytest.approx(1 / 3))
+    after = (line[tokens.AFTER_RIGHT], line[tokens.AFTER_WRONG])
     assert [(each.value, each.n) for each in after] == [(1, 1), (0, 2)]
     assert list(beside.index) == ["s"]
-    losses = choices.losses(both, pd.DataFrame(rows, columns=columns)).loss
-    cost = losses[choices.TO_SCENE, "s"]
+    losses = tokens.losses(both, pd.DataFrame(rows, columns=columns)).loss
+    cost = losses[tokens.TO_SCENE, "s"]
     assert (cost.value, cost.n) == (pytest.approx(-1 / 3), 3)
     assert cost.low <= cost.value <= cost.high
-    cost = losses[choices.TO_POLICY, "s"]
+    cost = losses[tokens.TO_POLICY, "s"]
     assert (cost.value, cost.n) == (0, 3), "one of three in the scene, and one of three touched"
     assert cost.low <= 0 <= cost.high
 
 
 def chosen_in_both(right: dict[str, tuple[bool, bool]], episodes: int) -> pd.DataFrame:
-    """Rows of `choices.scores`: per object, whether it is chosen in photos and in the scene."""
+    """Rows of `tokens.scores`: per object, whether it is chosen in photos and in the scene."""
     lines = []
     for target, by_view in right.items():
-        for seen_in, is_right in zip((choices.PHOTO, choices.SCENE), by_view, strict=True):
+        for seen_in, is_right in zip((tokens.PHOTO, tokens.SCENE), by_view, strict=True):
             for episode in range(episodes):
                 about = {"suite": "s", "task": target, "object": target, "episode": episode}
                 for shown, score in ((target, float(is_right)), ("look-alike", 0.5)):
@@ -350,12 +348,12 @@ def test_objects_are_the_units_whatever_the_number_of_their_episodes(episodes: i
     """Each object has one learned token: more episodes with it say nothing of other tokens."""
     table = chosen_in_both({"cup": (True, False), "owl": (True, True)}, episodes)
     touched = touches({"cup": False, "owl": False}, episodes)
-    losses = choices.losses(table, touched).loss
-    cost = losses[choices.TO_SCENE, "s"]
+    losses = tokens.losses(table, touched).loss
+    cost = losses[tokens.TO_SCENE, "s"]
     assert (cost.value, cost.low, cost.high, cost.n) == (0.5, 0, 1, 2 * episodes)
-    cost = losses[choices.TO_POLICY, "s"]
+    cost = losses[tokens.TO_POLICY, "s"]
     assert (cost.value, cost.low, cost.high) == (0.5, 0, 1)
-    in_scene = choices.beside_policy(table, touched, ["soft"]).loc["s", choices.IN_SCENE]
+    in_scene = tokens.beside_policy(table, touched, ["soft"]).loc["s", tokens.IN_SCENE]
     wilson = rate(1, 2)
     assert (in_scene.value, in_scene.n) == (0.5, 2 * episodes)
     assert (in_scene.low, in_scene.high) == pytest.approx((wilson.low, wilson.high))
@@ -366,7 +364,7 @@ def test_rows_of_several_trainings_of_one_word_are_refused() -> None:
     table = chosen_in_both({"cup": (True, False)}, 6)
     again = pd.concat([table, table], ignore_index=True)
     with pytest.raises(BadStudy, match="of several trainings of one word; choose one by k, epochs"):
-        choices.losses(again, touches({"cup": False}, 6))
+        tokens.losses(again, touches({"cup": False}, 6))
 
 
 def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
@@ -375,8 +373,8 @@ def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
     other = chosen_in_both({"cup": (True, False), "owl": (True, True)}, 2).assign(suite="other")
     touched = touches(dict.fromkeys([*right], False), 2)
     touched = pd.concat([touched, touches({"cup": False, "owl": True}, 2).assign(suite="other")])
-    found = choices.losses(pd.concat([one, other]), touched).loc[choices.TO_SCENE]
-    assert list(found.index) == ["s", "other", choices.ALL_SUITES]
+    found = tokens.losses(pd.concat([one, other]), touched).loc[tokens.TO_SCENE]
+    assert list(found.index) == ["s", "other", tokens.ALL_SUITES]
     assert list(found.objects) == [6, 2, 8]
     assert [each.value for each in found.loss] == pytest.approx([1, 0.5, 7 / 8])
     assert list(found.p) == pytest.approx([2**-5, 1, 2**-6])
@@ -386,19 +384,19 @@ def test_the_loss_of_a_suite_is_corrected_for_the_others() -> None:
 def test_the_differences_of_forms_of_the_token_are_by_token() -> None:
     """Those of the published table: four tokens, whose mean says little of a fifth."""
     loop = pd.read_parquet(DATA / "results" / "token_closed_loop.parquet")
-    own = report.success_by_token(loop, "soft-own")
+    own = tokens.success_by_token(loop, "soft-own")
     assert {task: round(100 * gain) for (_, task), gain in own.items()} == {
         "pick-shaver": -50,
         "put-camera": -4,
         "put-owl-figurine": -17,
         "put-straw-cup": -42,
     }
-    found = report.mean_of_tokens(list(own), least=-1.0)
+    found = tokens.mean_of_tokens(list(own), least=-1.0)
     reference = stats.ttest_1samp(own, 0).confidence_interval()
     assert found.n == 4
     assert (found.low, found.high) == pytest.approx((reference.low, reference.high))
     assert found.low < 0 < found.high
-    certain = report.mean_of_tokens([-1.0, -0.9], least=-1.0)
+    certain = tokens.mean_of_tokens([-1.0, -0.9], least=-1.0)
     assert certain.low == -1, "no success is lost twice"
 
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from vap_core.base.errors import BadPolicy
-from vap_core.evaluation.policy_names import shipped
 from vap_core.policies.hooks import observe_attention, observe_inputs
 from vap_core.policies.lerobot import traced
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
@@ -19,6 +18,7 @@ from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.weight_guard import unchanged_weights
 from vap_core.simulation import suites
+from vap_core.study.trials import shipped
 
 from .test_mini_pi0 import checkpoint  # noqa: F401
 

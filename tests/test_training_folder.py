@@ -93,7 +93,7 @@ def test_another_recipe_is_refused_before_the_work(
 
 HOLD = """
 import fcntl, pathlib, sys
-from vap_core.evaluation.store import locked
+from vap_core.study.store import locked
 with locked(pathlib.Path(sys.argv[1]), fcntl.lockf):
     print("held", flush=True)
     sys.stdin.read()

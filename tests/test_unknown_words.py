@@ -1,8 +1,8 @@
 """A run says which words of its instructions its mini-pi0 does not know."""
 
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.unknown_words import unknown_words, unknown_words_notes
 from vap_core.simulation import suites
+from vap_core.study.engine import unknown_words, unknown_words_notes
+from vap_core.study.trials import Study
 
 
 def test_words_are_compared_in_lower_case_and_told_once() -> None:

@@ -10,11 +10,11 @@ from rerun.chunk import RrdReader
 
 from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, opening, rerun
 from vap_core.base.types import Track
-from vap_core.evaluation.diagnosis import explain
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.entities.curves import LINE_CHARACTERS
 from vap_core.rollout.types import MaskCoverage
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.diagnosis import explain
 
 
 def fail(

@@ -15,15 +15,6 @@ if TYPE_CHECKING:
     from vap_core.base.errors import VapError as VapError
     from vap_core.base.photos import load_photo as load_photo
     from vap_core.base.photos import photos_in as photos_in
-    from vap_core.evaluation.diagnosis import diagnose as diagnose
-    from vap_core.evaluation.methods import METHODS as METHODS
-    from vap_core.evaluation.metrics import rate as rate
-    from vap_core.evaluation.photos.run import measure_photos as measure_photos
-    from vap_core.evaluation.policy_names import shipped as shipped
-    from vap_core.evaluation.study import DEMO as DEMO
-    from vap_core.evaluation.study import Study as Study
-    from vap_core.evaluation.trials import make_trial as make_trial
-    from vap_core.evaluation.trials import register_personal as register_personal
     from vap_core.instruction import parse as parse
     from vap_core.instruction import rewrite as rewrite
     from vap_core.memory import load as load
@@ -49,6 +40,15 @@ if TYPE_CHECKING:
     from vap_core.simulation.studio import reference_views as reference_views
     from vap_core.simulation.suites import BENCHMARKS as BENCHMARKS
     from vap_core.simulation.suites.open_row import open_row as open_row
+    from vap_core.study.diagnosis import diagnose as diagnose
+    from vap_core.study.methods import METHODS as METHODS
+    from vap_core.study.photos import measure_photos as measure_photos
+    from vap_core.study.stats import rate as rate
+    from vap_core.study.trials import DEMO as DEMO
+    from vap_core.study.trials import Study as Study
+    from vap_core.study.trials import make_trial as make_trial
+    from vap_core.study.trials import register_personal as register_personal
+    from vap_core.study.trials import shipped as shipped
     from vap_core.vote import similarity as similarity
 
 __version__ = "0.1.0"
@@ -59,13 +59,11 @@ _load, __dir__, __all__ = lazy_loader.attach(
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
         "base.photos": ["load_photo", "photos_in"],
-        "evaluation.diagnosis": ["diagnose"],
-        "evaluation.methods": ["METHODS"],
-        "evaluation.metrics": ["rate"],
-        "evaluation.photos.run": ["measure_photos"],
-        "evaluation.policy_names": ["shipped"],
-        "evaluation.study": ["DEMO", "Study"],
-        "evaluation.trials": ["make_trial", "register_personal"],
+        "study.diagnosis": ["diagnose"],
+        "study.methods": ["METHODS"],
+        "study.photos": ["measure_photos"],
+        "study.stats": ["rate"],
+        "study.trials": ["DEMO", "Study", "make_trial", "register_personal", "shipped"],
         "instruction": ["parse", "rewrite"],
         "memory": ["load", "load_bank", "register", "save"],
         "perception.protocols": ["Stack"],

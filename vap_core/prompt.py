@@ -58,7 +58,7 @@ def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
 
 @runtime_checkable
 class PromptForm(Protocol):
-    """How one target is marked in one view. Other forms are ablations (evaluation.ablations)."""
+    """How one target is marked in one view. Other forms are ablations (study.methods)."""
 
     def __call__(self, rgb: Rgb, mask: Mask, colour: Colour, others: Sequence[Mask]) -> Rgb:
         """The marked picture; `rgb` stays as it is.

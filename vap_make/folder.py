@@ -14,8 +14,8 @@ import torch
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import make_folder, parse_json, write_atomic, writing
-from vap_core.evaluation.store import LOCK, differences, locked
 from vap_core.policies.lerobot.checkpoints import RECIPE
+from vap_core.study.store import LOCK, differences, locked
 
 STATE = "training.pt"
 """The file that a training goes on from."""

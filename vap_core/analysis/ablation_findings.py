@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from vap_core.base.tables import signed
-from vap_core.evaluation.ablations.picture import is_shown
-from vap_core.evaluation.ablations.table import ArmResult
-from vap_core.evaluation.statistics import Comparison, points_text
+from vap_core.study.ablations import ArmResult, is_shown
+from vap_core.study.stats import Comparison, points_text
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,20 +11,22 @@ from typing import TYPE_CHECKING
 
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import CASES
-from vap_core.evaluation.ablations.arms import ABLATIONS
-from vap_core.evaluation.ablations.picture import (
+from vap_core.study.ablations import (
     CLEAR,
     PAPER,
+    PAPER_SUITES,
+    ArmResult,
+    arm_results,
     draw_effects,
     draw_other,
     legend_handles,
 )
-from vap_core.evaluation.ablations.picture import policies_figure as policies_figure
-from vap_core.evaluation.ablations.table import PAPER_SUITES, ArmResult, arm_results
-from vap_core.evaluation.ablations.table import across_policies as across_policies
-from vap_core.evaluation.ablations.table import policy_results as policy_results
-from vap_core.evaluation.publish import read_runs
-from vap_core.evaluation.statistics import points_text
+from vap_core.study.ablations import across_policies as across_policies
+from vap_core.study.ablations import policies_figure as policies_figure
+from vap_core.study.ablations import policy_results as policy_results
+from vap_core.study.methods import ABLATIONS
+from vap_core.study.results import read_runs
+from vap_core.study.stats import points_text
 
 if TYPE_CHECKING:
     import pandas as pd

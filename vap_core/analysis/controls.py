@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import one_of
 from vap_core.base.extras import require
 from vap_core.base.files import write_atomic
-from vap_core.evaluation.perception.estimates import share
 from vap_core.simulation.suites import BENCHMARKS, WARM_UPS, suite
+from vap_core.study.stats import share
 
 if TYPE_CHECKING:
     import pandas as pd

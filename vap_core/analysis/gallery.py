@@ -14,7 +14,6 @@ from vap_core.analysis.plots import Tile
 from vap_core.base.figures import TIER_COLOURS
 from vap_core.base.parquet import read_parquet
 from vap_core.base.types import PersonalObject, Rgb
-from vap_core.evaluation.metrics import Score, rate, score
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Encoder
 from vap_core.policies.scripted.expert import Expert
@@ -32,6 +31,7 @@ from vap_core.simulation.studio import Shot, Stage
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.stats import Score, rate, score
 
 if TYPE_CHECKING:
     import pandas as pd

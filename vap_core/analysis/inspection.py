@@ -18,10 +18,6 @@ from vap_core.base.figures import GENERIC, OTHER, WINNER, empty_figure
 from vap_core.base.files import writing
 from vap_core.base.parquet import read_parquet
 from vap_core.base.types import Grounding, Mask, PersonalObject
-from vap_core.evaluation.perception.episodes import OFF
-from vap_core.evaluation.perception.first_frames import VISIBLE_PX, View, object_under_box
-from vap_core.evaluation.perception.run import TABLES
-from vap_core.evaluation.perception.tracking import KEPT
 from vap_core.perception.boxes import mask_box, mask_iou
 from vap_core.perception.protocols import Stack
 from vap_core.policies.scripted.expert import Expert
@@ -34,6 +30,9 @@ from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.studio import write_views
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Outcome
+from vap_core.study.perception import OFF, VISIBLE_PX, View, object_under_box
+from vap_core.study.survey import TABLES
+from vap_core.study.tracking import KEPT
 
 if TYPE_CHECKING:
     import pandas as pd

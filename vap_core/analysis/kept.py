@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vap_core.analysis.plots import keep, small_jpeg
 from vap_core.base.files import write_atomic
 from vap_core.base.version import code_digest
-from vap_core.evaluation.measurements import encode_table
+from vap_core.study.store import encode_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,8 +24,8 @@ from vap_core.base.palette import (
 )
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
 from vap_core.base.vote_picture import vote_picture
-from vap_core.evaluation.metrics import Rate
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.stats import Rate
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,9 +13,6 @@ import numpy as np
 
 from vap_core.attend import Prompting
 from vap_core.base.types import Mask, Rgb
-from vap_core.evaluation.ablations.arms import ABLATIONS, DEFAULT
-from vap_core.evaluation.ablations.arrow import hand_pixel
-from vap_core.evaluation.ablations.forms import draw_arrow
 from vap_core.perception.boxes import mask_box
 from vap_core.prompt import PALETTE, Tint, choose_colours
 from vap_core.simulation import robots
@@ -24,6 +21,8 @@ from vap_core.simulation.control import pose_transform
 from vap_core.simulation.suites import suite
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.forms import draw_arrow, hand_pixel
+from vap_core.study.methods import ABLATIONS, DEFAULT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

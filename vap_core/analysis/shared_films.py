@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 
 from vap_core.analysis.plots import film
 from vap_core.base.types import Rgb
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.types import Episode, Frame
 from vap_core.simulation import suites
+from vap_core.study.trials import Study, make_trial, register_personal
 
 if TYPE_CHECKING:
     import pandas as pd

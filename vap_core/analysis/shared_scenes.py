@@ -15,15 +15,14 @@ import numpy as np
 from vap_core.base.errors import BadOutput
 from vap_core.base.figures import empty_figure
 from vap_core.base.palette import FRAME, GRID, METHODS, TEXT
-from vap_core.evaluation import paper
-from vap_core.evaluation.metrics import Rate, rate
-from vap_core.evaluation.parsers.paraphrases import KINDS
-from vap_core.evaluation.publish import read_runs
-from vap_core.evaluation.statistics import bootstrap_interval
 from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.simulation.suites.simpler import FILMED_AREA
+from vap_core.study import paper
+from vap_core.study.parsers import KINDS
+from vap_core.study.results import read_runs
+from vap_core.study.stats import Rate, bootstrap_interval, rate
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,10 +23,10 @@ from vap_core.cli.command import StackName
 from vap_core.cli.timing import Parts
 
 if TYPE_CHECKING:
-    from vap_core.evaluation.jobs import Job
-    from vap_core.evaluation.study import Study
     from vap_core.rollout.loop import Trial
     from vap_core.simulation.types import EpisodeRow
+    from vap_core.study.engine import Job
+    from vap_core.study.trials import Study
 
 app = typer.Typer()
 Cost = dict[str, Any]
@@ -74,7 +74,7 @@ def table(arms: Sequence[Arm], clock: str = "cpu") -> str:
     import numpy as np
 
     from vap_core.base.tables import align
-    from vap_core.evaluation.statistics import ratio
+    from vap_core.study.stats import ratio
 
     parts = list(dict.fromkeys(part for arm in arms for part in arm.costs[0].get("parts", ())))
     rows = [["", "", f"{clock} ms", "lowest .. highest", "times the first [95 %]", *parts]]
@@ -109,7 +109,7 @@ JUDGE = "vap_core.simulation.suites.rules:Judge.step"
 WHOLE = {"scene", "tracker: re-detection", "grounding", "environment", "attend", "policy"}
 """Parts that keep the time of the parts that they call."""
 PARTS = {
-    "scene": ("vap_core.evaluation.jobs:make_trial",),
+    "scene": ("vap_core.study.engine:make_trial",),
     "mj_step": ("mujoco:mj_step",),
     "contacts": (f"{ENV}_advance",),
     "IK": (f"{ENV}commanded",),
@@ -185,13 +185,12 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     """Parts of the prompted control loop, its recording and a query, beside a backbone pass."""
     import numpy as np
 
-    from vap_core.evaluation import diagnosis, steps, store
-    from vap_core.evaluation.study import DEMO
-    from vap_core.evaluation.trials import make_trial, register_personal
     from vap_core.perception.embedded.backbone import features
     from vap_core.recording import DeferredRecorder
     from vap_core.rollout.loop import rollout
     from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.study import diagnosis, steps, store
+    from vap_core.study.trials import DEMO, make_trial, register_personal
 
     register_personal(DEMO, folder / "memory")
     suite, task = DEMO.tasks[-1]
@@ -257,7 +256,7 @@ def costed(work: Callable[[], object]) -> Callable[[], Cost | None]:
 
 def jobs_of(study: "Study", rows: Sequence["EpisodeRow"], folder: Path) -> "list[Job]":
     """Rows of one task in batches, as eval makes them; failures are recorded."""
-    from vap_core.evaluation.jobs import Job
+    from vap_core.study.engine import Job
 
     found = []
     for first in range(0, len(rows), BATCH):
@@ -277,11 +276,9 @@ TASKS = {
 
 def profile(folder: Path, quick: bool) -> list[Arm]:
     """A control step of eval by part: every suite and two methods with the shipped policies."""
-    from vap_core.evaluation.engine import spread_evenly
-    from vap_core.evaluation.jobs import run_job
-    from vap_core.evaluation.policy_names import MINI
-    from vap_core.evaluation.study import Study
-    from vap_core.evaluation.trials import register_personal
+    from vap_core.policies.names import MINI
+    from vap_core.study.engine import run_job, spread_evenly
+    from vap_core.study.trials import Study, register_personal
 
     arms = []
     for suite, tasks in list(TASKS.items())[: 1 if quick else None]:
@@ -346,19 +343,18 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
     from importlib.util import find_spec
 
     from vap_core.attend import Attender
-    from vap_core.evaluation import cluster, engine, processes
-    from vap_core.evaluation.policy_names import MINI
-    from vap_core.evaluation.study import Study
-    from vap_core.evaluation.trials import register_personal
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
+    from vap_core.policies.names import MINI
     from vap_core.rollout.loop import Trial, rollout
     from vap_core.rollout.prompters.tint import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.env import Env
     from vap_core.simulation.suites.open_row import build_scene
+    from vap_core.study import cluster, engine, processes
+    from vap_core.study.trials import Study, register_personal
 
     steps = 2 if quick else 20
     suite = suites.suite(SCALE[0])
@@ -470,9 +466,9 @@ def policy(folder: Path, quick: bool) -> list[Arm]:
     import numpy as np
 
     from vap_core.analysis.attention.effects import noise_input
-    from vap_core.evaluation.policy_names import shipped
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.study.trials import shipped
 
     arms = []
     for name in list(BENCHMARKS)[: 1 if quick else None]:
@@ -644,7 +640,7 @@ def speed_up(arms: Sequence[Arm], clock: str, ours: str, theirs: str) -> tuple[f
     """
     import numpy as np
 
-    from vap_core.evaluation.statistics import ratio
+    from vap_core.study.stats import ratio
 
     code = next(arm.facts["code"] for arm in arms if arm.facts["loop"] == "lerobot")
     slow = [

@@ -88,8 +88,12 @@ def diagnose(
         --note "it held for a moment"
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.diagnosis.failures import failures_text, list_failures
-    from vap_core.evaluation.diagnosis.recordings import correct_failure, recording_to_show
+    from vap_core.study.failures import (
+        correct_failure,
+        failures_text,
+        list_failures,
+        recording_to_show,
+    )
 
     if against is not None and mp4 is not None:
         raise BadStudy(
@@ -150,7 +154,7 @@ def query(
         "select method, camera, avg(track_score) from steps group by method, camera"
     """
     from vap_core.base.tables import align
-    from vap_core.evaluation import steps
+    from vap_core.study import steps
 
     if question is None:
         joined, episodes = steps.read(run)
@@ -307,12 +311,12 @@ def report(
     Example: python -m vap_core report data/results/scripted.parquet --out data/runs/scripted-report
     """
     if rescore:
-        from vap_core.evaluation.rescore import rescore as judge_again
+        from vap_core.study.report import rescore as judge_again
 
         for run in runs:
             print(judge_again(run))
         return
-    from vap_core.evaluation.report import report as conclude
+    from vap_core.study.report import report as conclude
 
     folder = out or _report_folder(runs[0])
     print(conclude(runs, folder))
@@ -358,7 +362,7 @@ def publish(
     Example: python -m vap_core publish data/results/mine.parquet --suite simpler-bridge
         --methods generic,vap --to data/results/bridge.parquet
     """
-    from vap_core.evaluation.publish import publish as write_table
+    from vap_core.study.results import publish as write_table
 
     n_episodes = write_table(
         runs,

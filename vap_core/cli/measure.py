@@ -49,12 +49,11 @@ def eval_perception(
 
     Example: python -m vap_core measure perception --suite simpler-bridge --quick
     """
-    from vap_core.evaluation.perception.report import conclude
-    from vap_core.evaluation.perception.run import Survey, run_survey
-    from vap_core.evaluation.perception.run import publish as write_tables
     from vap_core.perception.foundation.store import check_present
     from vap_core.perception.stacks import check_stack
     from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.study.survey import Survey, conclude, run_survey
+    from vap_core.study.survey import publish as write_tables
 
     check_stack(stack)
     check_present(stack)
@@ -96,7 +95,7 @@ def eval_photos(
     Example: python -m vap_core measure photos my-photos
     Example: python -m vap_core measure photos my-photos --clips
     """
-    from vap_core.evaluation.photos.run import measure_photos
+    from vap_core.study.photos import measure_photos
 
     folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
     print(measure_photos(folder, folder_of_run, stack, clips=clips))
@@ -133,7 +132,7 @@ def eval_objects(
 
     Example: python -m vap_core measure objects data/designs
     """
-    from vap_core.evaluation.own_objects.run import ObjectSurvey, measure_objects
+    from vap_core.study.objects import ObjectSurvey, measure_objects
 
     asked = ObjectSurvey(
         suites=tuple(dict.fromkeys(suite or ["tabletop"])),
@@ -229,13 +228,12 @@ def eval_parsers(
     Example: python -m vap_core measure parsers --parser chat --part test --limit 20
     """
     from vap_core.base.errors import BadStudy, one_of
-    from vap_core.evaluation.parsers import report
-    from vap_core.evaluation.parsers.measure import answer_table, measure
-    from vap_core.evaluation.parsers.paraphrases import PARTS, suite_names
     from vap_core.instruction.parsers import load_parser
+    from vap_core.study import parsers
+    from vap_core.study.parsers import PARTS, answer_table, measure, suite_names
 
-    parsers = names(parser)
-    if not parsers:
+    asked = names(parser)
+    if not asked:
         raise BadStudy(
             f"measure parsers: --parser {parser!r} names no parser; name one, or leave the option "
             "out for the default, rule,embedding."
@@ -247,7 +245,7 @@ def eval_parsers(
             if name not in known:
                 raise one_of(f"measure parsers: {what}", name, known)
     answers = []
-    for name in parsers:
+    for name in asked:
         answers += measure(name, partial(load_parser, name), suites, parts, limit)
     table = answer_table(answers)
     if wrong:
@@ -255,9 +253,9 @@ def eval_parsers(
             if not answer.right:
                 found = answer.found or answer.error or "nothing"
                 print(f"{answer.parser}: {answer.text!r} means {answer.meant or 'none'}: {found}")
-    print(report.text(table))
+    print(parsers.text(table))
     if publish is not None:
-        print(f"wrote {', '.join(map(str, report.publish(table, publish)))}")
+        print(f"wrote {', '.join(map(str, parsers.publish(table, publish)))}")
 
 
 @app.command("policy")
@@ -303,8 +301,8 @@ def eval_policy(
     Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,tinted-magenta
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.study import Study
     from vap_core.simulation import suites
+    from vap_core.study.trials import Study
     from vap_make.policy.probe import conclude, keep, kept, probe
 
     tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
@@ -359,10 +357,9 @@ def eval_tokens(
         --out data/runs/few-tokens
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.tokens.report import report
-    from vap_core.evaluation.tokens.study import Tokens, run
-    from vap_core.evaluation.tokens.study import publish as write_tables
     from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.study.tokens import Tokens, report, run
+    from vap_core.study.tokens import publish as write_tables
 
     ks = tuple(int(number) for number in names(k) if number.isdecimal() and int(number))
     if len(ks) != len(names(k)) or not ks:
@@ -409,8 +406,8 @@ def embeddings(
 
     from vap_core.analysis.embeddings import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy
-    from vap_core.evaluation.policy_names import shipped
     from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.study.trials import shipped
 
     folders = list(policies or ())
     if vlm is None:
@@ -485,7 +482,7 @@ def attention(
     Example: python -m vap_core measure attention data/results/first_policy.parquet
         --record simpler-bridge/put-camera/soft/22
     """
-    from vap_core.analysis.attention import examples, replay, report
+    from vap_core.analysis.attention import examples, replay
     from vap_core.analysis.attention.tables import publish as publish_tables
     from vap_core.base.commands import command
 
@@ -507,4 +504,4 @@ def attention(
     found = replay.run_replay(run, out, wanted, workers=workers)
     if publish is not None:
         publish_tables(out, publish)
-    print(report.text(found))
+    print(parsers.text(found))

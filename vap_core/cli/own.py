@@ -96,12 +96,12 @@ def register(
     from contextlib import suppress
 
     from vap_core.base.commands import command
-    from vap_core.evaluation.photos import register as registering
-    from vap_core.evaluation.photos.trust import leave_one_out, warnings
     from vap_core.instruction.owners import check_owner
     from vap_core.memory import check_names, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
+    from vap_core.study import register as registering
+    from vap_core.study.register import leave_one_out, warnings
 
     check_names(name, category)
     check_owner(owner, known_as or [], note)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from vap_core.cli.command import RunFolder, StackName, Workers, names, takes
-from vap_core.evaluation.run_schema import LARGEST_SEED
+from vap_core.study.results import LARGEST_SEED
 
 if TYPE_CHECKING:
-    from vap_core.evaluation.jobs import Record
-    from vap_core.evaluation.study import Study
+    from vap_core.study.engine import Record
+    from vap_core.study.trials import Study
 
 app = typer.Typer()
 
@@ -206,10 +206,10 @@ def demo(asked: AskedOfDemo) -> None:
 
     Example: python -m vap_core demo --episodes 20
     """
-    from vap_core.evaluation.worker_server import start_server
+    from vap_core.study.engine import start_server
 
     start_server("scripted", asked.out)
-    from vap_core.evaluation.study import DEMO
+    from vap_core.study.trials import DEMO
 
     study = replace(DEMO, episodes=asked.episodes, seed=asked.seed)
     run_study(study, AskedOfAll([], out=asked.out, workers=asked.workers, record="all"))
@@ -221,7 +221,7 @@ def suites() -> None:
 
     Example: python -m vap_core suites
     """
-    from vap_core.evaluation.report import suites_table
+    from vap_core.study.report import suites_table
 
     print(suites_table())
 
@@ -293,7 +293,7 @@ def ablate(
     """
     from vap_core.base.errors import BadStudy, one_of
     from vap_core.base.tables import align
-    from vap_core.evaluation.ablations.arms import ABLATIONS
+    from vap_core.study.methods import ABLATIONS
 
     if name is None:
         rows = [["ablation", "question", "arms"]]
@@ -305,7 +305,7 @@ def ablate(
         return
     if name not in ABLATIONS:
         raise one_of("ablate: ablation", name, ABLATIONS)
-    from vap_core.evaluation.ablations.run import ablate_text
+    from vap_core.study.ablations import ablate_text
 
     about = ABLATIONS[name]
     if about.policies:
@@ -342,7 +342,7 @@ def run_suites(asked: AskedOfAll) -> None:
         check_policy_name(asked.policy)
     if asked.address and asked.engine != "ray":
         raise BadStudy("eval: --address needs --engine ray.")
-    from vap_core.evaluation.worker_server import probable_policy, start_server
+    from vap_core.study.engine import probable_policy, start_server
 
     likely = asked.policy or probable_policy(asked.suite)
     if likely and asked.engine == "local":
@@ -366,10 +366,10 @@ def study_of(asked: AskedOfAll) -> "Study":
         BadSuite; else as `Study`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.policy_names import PRIVILEGED, default_policy
-    from vap_core.evaluation.study import Study
+    from vap_core.policies.names import PRIVILEGED
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.suites import BENCHMARKS, open_file, tasks_of
+    from vap_core.study.trials import Study, default_policy
 
     suite_names: list[str] = []
     files: dict[str, None] = {}
@@ -428,14 +428,14 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
         BadCluster when there is none at the address; BadOutput, WorkerDied, as `engine.run`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.evaluation.cluster import ray_executor
-    from vap_core.evaluation.engine import run
-    from vap_core.evaluation.policy_names import PRIVILEGED
-    from vap_core.evaluation.power import detectable_effect_text
-    from vap_core.evaluation.processes import results
-    from vap_core.evaluation.report import conclude
-    from vap_core.evaluation.store import MANIFEST
+    from vap_core.policies.names import PRIVILEGED
     from vap_core.rollout.queries import named_queries
+    from vap_core.study.cluster import ray_executor
+    from vap_core.study.engine import run
+    from vap_core.study.processes import results
+    from vap_core.study.report import conclude
+    from vap_core.study.stats import detectable_effect_text
+    from vap_core.study.store import MANIFEST
 
     out = asked.out or default_folder(study.policy, asked)
     address = asked.address or ("127.0.0.1:6379" if asked.engine == "ray" else None)
@@ -455,7 +455,7 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
         for track, rows in tracks.items():
             print(f"{track}: {detectable_effect_text(rows)}", file=sys.stderr)
     if study.object and study.policy != "expert" and not (out / MANIFEST).exists():
-        from vap_core.evaluation.feasibility import check_feasible
+        from vap_core.study.trials import check_feasible
 
         print("the expert tries the episodes first ...", file=sys.stderr)
         for tried in check_feasible(study):
@@ -473,6 +473,6 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
     )
     print(conclude(study, table, out))
     if study.audit:
-        from vap_core.evaluation.input_audit import verdict
+        from vap_core.study.logs import verdict
 
         print("\n" + verdict(out))

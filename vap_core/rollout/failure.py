@@ -1,6 +1,6 @@
 """The diagnosis of a failed episode: its case, and the trace that explains it.
 
-The rules are in evaluation.diagnosis.
+The rules are in study.diagnosis.
 """
 
 import json

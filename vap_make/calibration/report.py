@@ -10,8 +10,8 @@ import numpy as np
 
 from vap_core.base.tables import Rows, align
 from vap_core.base.types import value
-from vap_core.evaluation.perception.estimates import clustered_share
 from vap_core.perception.protocols import FamiliarityJudge, Stack, Thresholds
+from vap_core.study.stats import clustered_share
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,14 +9,14 @@ from vap_core import __version__
 from vap_core.base.errors import BadOutput, BadPhotoSet
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.parquet import read_parquet
-from vap_core.evaluation import store
-from vap_core.evaluation.measurements import read_json_part, write_json_part
-from vap_core.evaluation.photos.run import TABLE, measure_photos
 from vap_core.perception.foundation.sources import needs_photos
 from vap_core.perception.foundation.store import store_folder
 from vap_core.perception.kept_thresholds import keep_command, keep_thresholds
 from vap_core.perception.protocols import FamiliarityJudge, Stack
 from vap_core.perception.stacks import checksums, is_own, load_stack, ships_thresholds
+from vap_core.study import store
+from vap_core.study.photos import TABLE, measure_photos
+from vap_core.study.store import read_json_part, write_json_part
 from vap_make.calibration.report import PRICE, Choice, choose, text_report
 from vap_make.calibration.scenes import SEED, Row, measure_scene
 
@@ -154,7 +154,7 @@ def _measure(
 
 def _photo_rows(answers: "pd.DataFrame") -> "pd.DataFrame":
     """The answers of a photo set in the form of the scenes'."""
-    from vap_core.evaluation.photos.report import RIGHT_IOU
+    from vap_core.study.photos import RIGHT_IOU
 
     cases = []
     for present, lookalikes in zip(answers.present, answers.lookalikes, strict=True):

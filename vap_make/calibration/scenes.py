@@ -10,18 +10,13 @@ from typing import Any, Literal
 import numpy as np
 
 from vap_core.base.types import PersonalObject, election_scores, likeness
-from vap_core.evaluation.perception.first_frames import (
-    View,
-    object_under_box,
-    opening_views,
-    registered_object,
-)
 from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS
 from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study.perception import View, object_under_box, opening_views, registered_object
 from vap_core.vote import compare, nominate, vote
 from vap_make.films.demonstrations import draw_objects, row
 from vap_make.recipe import filmed_tasks

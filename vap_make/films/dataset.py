@@ -30,11 +30,11 @@ from PIL import Image
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, read_file, write_atomic, writing
 from vap_core.base.version import code_version
-from vap_core.evaluation.processes import results
-from vap_core.evaluation.store import locked, open_run
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Suite, suite
 from vap_core.simulation.types import EE_ACTION
+from vap_core.study.processes import results
+from vap_core.study.store import locked, open_run
 from vap_make.films.demonstrations import MOST, PARTS, Film, cached, stage_file
 from vap_make.recipe import every, filmed_task
 

@@ -10,9 +10,6 @@ import numpy as np
 from tqdm import tqdm
 
 from vap_core.base.types import value
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.perception.estimates import average_precision
-from vap_core.evaluation.perception.first_frames import FLOOR, VISIBLE_PX, match
 from vap_core.perception.boxes import box_iou, crop, mask_iou
 from vap_core.perception.embedded.detect_network import DetectHead, DetectNetwork
 from vap_core.perception.embedded.detector import (
@@ -28,6 +25,8 @@ from vap_core.perception.embedded.runtime import TorchNetwork
 from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
+from vap_core.study.perception import FLOOR, VISIBLE_PX, match
+from vap_core.study.stats import average_precision, rate
 from vap_core.vote import similarity, vote
 from vap_make.films.scenes import POSES, Shots, boxes_of
 from vap_make.perception.segmenter import jitter

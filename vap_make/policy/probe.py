@@ -22,9 +22,6 @@ from vap_core.base.files import make_folder, write_atomic
 from vap_core.base.parquet import read_parquet
 from vap_core.base.tables import align
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
-from vap_core.evaluation.metrics import rate
-from vap_core.evaluation.policy_names import shipped
-from vap_core.evaluation.processes import results
 from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.policies.names import label_of
 from vap_core.prompt import ALPHA, PALETTE
@@ -34,6 +31,9 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
+from vap_core.study.processes import results
+from vap_core.study.stats import rate
+from vap_core.study.trials import shipped
 from vap_make.films.captions import describe, distinguishes
 from vap_make.films.demonstrations import draw_objects, row
 from vap_make.policy.colouring import natural_colours, painted, tinted

@@ -16,12 +16,12 @@ import numpy as np
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Rgb
-from vap_core.evaluation.processes import results_here
 from vap_core.policies.mini_pi0 import learned_token, token_file
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import photograph, reference_shots
+from vap_core.study.processes import results_here
 from vap_make.films.demonstrations import Film
 from vap_make.films.scenes import TRAIN_INSTANCES, only_generic
 from vap_make.folder import reading_kept

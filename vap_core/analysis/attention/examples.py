@@ -12,8 +12,8 @@ from vap_core.analysis.attention.pictures import run_again, strip
 from vap_core.analysis.plots import Tile
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import writing
-from vap_core.evaluation.publish import read_runs
 from vap_core.policies.hooks import AttentionMap, heat_map
+from vap_core.study.results import read_runs
 
 PARTS = ("suite", "task", "method", "episode")
 """What names an episode, with slashes between; that of another seed has the seed at its end."""

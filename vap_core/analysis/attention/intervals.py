@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from vap_core.evaluation.perception.estimates import NONE, Estimate
-from vap_core.evaluation.statistics import SEED
+from vap_core.study.stats import NONE, SEED, Estimate
 
 RESAMPLES = 2000
 Values = Float[np.ndarray, " n"]

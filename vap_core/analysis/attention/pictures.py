@@ -23,9 +23,6 @@ from vap_core.analysis.attention.replay import check_policy
 from vap_core.analysis.plots import Tile, sheet
 from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
-from vap_core.evaluation.diagnosis.recordings import listed_row, note_changed, study_of
-from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.policies.hooks import heat_map
 from vap_core.recording.entities.pictures import attention_overlay
 from vap_core.rollout.loop import rollout
@@ -34,6 +31,9 @@ from vap_core.rollout.types import Episode, EpisodeHeader, Frame
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.types import Outcome
+from vap_core.study.engine import spread_evenly
+from vap_core.study.failures import listed_row, note_changed, study_of
+from vap_core.study.trials import make_trial, register_personal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,8 +76,8 @@ def run_again(
 
     Raises: BadStudy, as `check_policy`.
     """
-    from vap_core.evaluation.diagnosis import explain
     from vap_core.recording import Recorder
+    from vap_core.study.diagnosis import explain
 
     study = study_of(manifest, line)
     row = listed_row(study, line)

@@ -14,21 +14,19 @@ from vap_core.analysis.attention import tables
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import writing
-from vap_core.evaluation import measurements
-from vap_core.evaluation.diagnosis.recordings import listed_row, study_of
-from vap_core.evaluation.engine import spread_evenly
-from vap_core.evaluation.jobs import BATCH
-from vap_core.evaluation.layouts import layout_name
-from vap_core.evaluation.methods import needs_token
-from vap_core.evaluation.processes import prepare, results
-from vap_core.evaluation.publish import read_runs
-from vap_core.evaluation.store import digest, locked
-from vap_core.evaluation.study import Study
-from vap_core.evaluation.trials import make_trial, register_personal
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow
+from vap_core.study import store
+from vap_core.study.engine import BATCH, spread_evenly
+from vap_core.study.failures import listed_row, study_of
+from vap_core.study.methods import needs_token
+from vap_core.study.processes import prepare, results
+from vap_core.study.results import read_runs
+from vap_core.study.stats import layout_name
+from vap_core.study.store import digest, locked
+from vap_core.study.trials import Study, make_trial, register_personal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,7 +108,7 @@ def run_replay(
                     register_personal(study, folder / "memory")
                 for job, rows in results(run_job, group, workers=workers, remedy="--workers"):
                     path = parts / f"{job.name}.json"
-                    measurements.write_json_part(path, rows, caller="attention")
+                    store.write_json_part(path, rows, caller="attention")
                     bar.update(len(job.rows))
         return _write_tables(source, folder, [parts / f"{job.name}.json" for job in jobs])
 
@@ -277,7 +275,7 @@ def _write_tables(source: Path, folder: Path, parts: Sequence[Path]) -> "dict[st
     """
     rows: dict[str, Rows] = {name: [] for name in (*tables.TABLES, ERRORS)}
     for path in parts:
-        for name, part in measurements.read_json_part(path, caller="attention").items():
+        for name, part in store.read_json_part(path, caller="attention").items():
             rows[name] += part
     errors = rows.pop(ERRORS)
     n = len(rows["episodes"])

@@ -15,9 +15,9 @@ from vap_core.analysis.attention.patterns import (
 )
 from vap_core.base.errors import BadStudy
 from vap_core.base.tables import align
-from vap_core.evaluation.perception.estimates import share
-from vap_core.evaluation.store import KEY
 from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study.stats import share
+from vap_core.study.store import KEY
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,7 +9,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.parquet import read_parquet
 from vap_core.base.version import code_version
-from vap_core.evaluation import measurements
+from vap_core.study import store
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,7 +36,7 @@ def write(
     about = json.dumps([{"runs": list(runs), "code": code_version()}], sort_keys=True).encode()
     for name in TABLES:
         table = pa.Table.from_pandas(_compact(pd.DataFrame(rows[name])), preserve_index=False)
-        data = measurements.encode_table(table.replace_schema_metadata({ABOUT: about}))
+        data = store.encode_table(table.replace_schema_metadata({ABOUT: about}))
         with writing(folder, "attention"):
             write_atomic(folder / file_name(name), data)
 
@@ -68,10 +68,10 @@ def publish(folder: Path, to: Path) -> list[Path]:
     for name, table in found.items():
         metadata = pq.read_schema(folder / file_name(name)).metadata or {}
         (about,) = parse_json(metadata[ABOUT])
-        files[file_name(name)] = measurements.add_rows(
+        files[file_name(name)] = store.add_rows(
             to / file_name(name), table, REPLACED, {ABOUT: about}, replaced=found["episodes"]
         )
-    return measurements.publish_tables(files, to, caller="attention")
+    return store.publish_tables(files, to, caller="attention")
 
 
 def _compact(table: "pd.DataFrame") -> "pd.DataFrame":

@@ -23,7 +23,7 @@ TRAINING_CARD, RECIPE = "training.json", "recipe.json"
 CAPTIONS, WORDS = "captions.json", "words"
 """How a checkpoint was trained, and what a training leaves beside it: none decides what it does."""
 RUN = "run.json"
-"""The manifest of a run, whose folder may be in a checkpoint's (evaluation.store)."""
+"""The manifest of a run, whose folder may be in a checkpoint's (study.store)."""
 WANTED_FILES = ("*.json", "*.safetensors", "*.model", "*.txt")
 
 

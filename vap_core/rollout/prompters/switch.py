@@ -1,7 +1,7 @@
 """A tint that changes sides: the target is prompted first, then one of its look-alikes.
 
 The command and the colour stay. Whether the robot follows, and how soon, says how far the tint
-steers it (evaluation.switching). A bound, not a result: the masks are the simulator's.
+steers it (study.logs). A bound, not a result: the masks are the simulator's.
 """
 
 from collections.abc import Mapping, Sequence

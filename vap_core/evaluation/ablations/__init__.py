@@ -1,1 +1,0 @@
-"""Ablations: the method with one thing changed at a time (P appendix)."""

@@ -1,1 +1,0 @@
-"""How well objects of one's own are found, and fetched among look-alikes, in a suite's episodes."""

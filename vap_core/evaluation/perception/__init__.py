@@ -1,5 +1,0 @@
-"""How well perception does on the benchmarks, measured against the simulator."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,0 @@
-"""What the learned tokens of personal objects recognize, in the model and in the policies."""

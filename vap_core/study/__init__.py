@@ -1,0 +1,5 @@
+"""Studies: what is measured, the engine that runs it, and its numbers, tables, charts, reports."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

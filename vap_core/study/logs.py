@@ -1,0 +1,309 @@
+"""What a run keeps of its episodes beside their rows: states, audited inputs, hidden and switched
+targets.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vap_core.base.errors import BadOutput
+from vap_core.base.parquet import read_parquet
+from vap_core.policies.hooks import TEXT
+from vap_core.rollout.prompters.switch import SWITCHED
+from vap_core.rollout.types import Episode, Frame, MaskCoverage
+from vap_core.simulation import robots
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.robots import Robot
+from vap_core.simulation.suites import suite
+from vap_core.simulation.types import Truth
+from vap_core.study.cases import THRESHOLDS
+from vap_core.study.stats import rate_over_layouts
+from vap_core.study.store import KEY, key_of, write_part
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def write_states(folder: Path, episodes: Sequence[Episode]) -> None:
+    """Add the states of some finished episodes to a run, as one part.
+
+    Episodes in error, and those of several sub-goals, are left out: they are not judged again.
+
+    Raises: BadOutput when the disk is full.
+    """
+    rows = []
+    for episode in episodes:
+        if episode.frames and not episode.subgoals and episode.outcome.status != "error":
+            rows.append(_to_row(episode))
+    if rows:
+        write_part(folder, "traces", rows, caller="traces")
+
+
+def read_states(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
+    """The key (store.KEY) of every saved episode, and its truths.
+
+    These are the settled start, then one per control step.
+
+    Raises: BadOutput for a part that is damaged.
+    """
+    keys: set[tuple[Any, ...]] = set()
+    for part in sorted((folder / "traces").glob("*.parquet")):
+        table = read_parquet(part, "traces", "delete it, its episodes cannot be judged again")
+        for row in table.to_dict("records"):
+            key = key_of(row)
+            if key not in keys:
+                keys.add(key)
+                yield key, _truths(row)
+
+
+def _to_row(episode: Episode) -> dict[str, Any]:
+    names = [place.model for place in episode.header.row.placements]
+    poses = []
+    touched = []
+    pressed = []
+    contacts = []
+    for frame in episode.frames:
+        truth = frame.truth
+        for name in names:
+            poses.append(truth.objects_world[name])
+        touched.append(list(truth.touched))
+        pressed.append(_pressed_to_text(truth.pressed_s))
+        contacts.append(_contacts_to_text(truth.contacts))
+    return {
+        **dict(zip(KEY, episode.key, strict=True)),
+        "objects": names,
+        "poses": np.concatenate(poses),
+        "touched": touched,
+        "pressed": pressed,
+        "contacts": contacts,
+    }
+
+
+def _truths(row: Mapping[str, Any]) -> list[Truth]:
+    names = list(row["objects"])
+    poses = np.asarray(row["poses"], np.float64).reshape(-1, len(names), 7)
+    truths = []
+    for step, touched, pressed, contacts in zip(
+        poses, row["touched"], row["pressed"], row["contacts"], strict=True
+    ):
+        truth = Truth(
+            objects_world=dict(zip(names, step, strict=True)),
+            links_world={},
+            touched=tuple(touched),
+            pressed_s=_pressed_from_text(pressed.tolist()),
+            contacts=_contacts_from_text(contacts.tolist()),
+        )
+        truths.append(truth)
+    return truths
+
+
+def _pressed_to_text(pressed_s: Mapping[str, float]) -> list[str]:
+    texts = []
+    for name, seconds in pressed_s.items():
+        texts.append(f"{name}={seconds!r}")
+    return texts
+
+
+def _pressed_from_text(texts: Sequence[str]) -> dict[str, float]:
+    pressed_s = {}
+    for text in texts:
+        name, seconds = text.rsplit("=", 1)
+        pressed_s[name] = float(seconds)
+    return pressed_s
+
+
+def _contacts_to_text(contacts: Mapping[str, frozenset[str]]) -> list[str]:
+    texts = []
+    for name in sorted(contacts):
+        for other in sorted(contacts[name]):
+            texts.append(f"{name}={other}")
+    return texts
+
+
+def _contacts_from_text(texts: Sequence[str]) -> dict[str, frozenset[str]]:
+    partners: dict[str, set[str]] = {}
+    for text in texts:
+        name, other = text.rsplit("=", 1)
+        partners.setdefault(name, set()).add(other)
+    contacts = {}
+    for name, others in partners.items():
+        contacts[name] = frozenset(others)
+    return contacts
+
+
+def write_audit(folder: Path, episodes: Sequence[Episode]) -> None:
+    """Add the calls of some finished episodes to a run. Raises: BadOutput."""
+    lines = []
+    for episode in episodes:
+        key = dict(zip(KEY, episode.key, strict=True))
+        for call in episode.consumed:
+            lines.append({**key, **asdict(call), "sound": call.sound})
+    if lines:
+        write_part(folder, "audit", lines, caller="audit")
+
+
+def read_audit(folder: Path) -> "pd.DataFrame":
+    """Every audited call of a run. Raises: BadOutput when the run was not audited."""
+    import pandas as pd
+
+    parts = sorted((folder / "audit").glob("*.parquet"))
+    if not parts:
+        raise BadOutput(
+            f"audit: {folder} was not audited; run it with --audit into another folder."
+        )
+    remedy = "delete it; its calls are not shown"
+    tables = [read_parquet(part, "audit", remedy) for part in parts]
+    whole = pd.concat(tables, ignore_index=True)
+    # A killed run may hold calls that the resumed run made again.
+    return whole.drop_duplicates([*KEY, "step", "name"], ignore_index=True)
+
+
+def verdict(folder: Path) -> str:
+    """A line per method: what the policy consumed, and where it is not as the prompt says.
+
+    Raises: BadOutput, as `read`.
+    """
+    table = read_audit(folder)
+    lines = []
+    for method, of_method in table.groupby("method"):
+        images = of_method[of_method.name != TEXT]
+        texts = of_method[of_method.name == TEXT]
+        wrong = of_method[~of_method.sound]
+        calls = len(of_method.drop_duplicates([*KEY, "step"]))
+        lines.append(
+            f"audit {method}: {calls} policy calls; {images.changed.sum()} of {len(images)} images "
+            f"tinted ({images.pixels.sum()} pixels), {texts.changed.sum()} of {len(texts)} texts "
+            f"rewritten; {len(wrong)} reached the policy otherwise"
+        )
+        for call in wrong[:5].itertuples():
+            what = "is missing" if call.changed else "changed"
+            lines.append(
+                f"  {call.suite}/{call.task} episode {call.episode} step {call.step}: "
+                f"{call.name} {what}"
+            )
+    return "\n".join(lines)
+
+
+CALLS = 2
+"""The track is kept if the prompt is on the target in one of so many prompted steps after it."""
+
+
+def hidden_columns(episode: Episode, occlusion: Occlusion | None) -> dict[str, Any]:
+    """What a results table keeps of an episode whose target was hidden; nothing of any other.
+
+    `hidden_s` is for how long, `track_kept` whether the track found it again.
+    """
+    if occlusion is None or not episode.frames:
+        return {}
+    later = []
+    for frame in episode.frames:
+        if frame.frame_index >= occlusion.start + occlusion.frames:
+            later.append(frame.coverage)
+    return {
+        "hidden_s": occlusion.frames / episode.header.hz,
+        "track_kept": is_track_kept(later, episode.header.row.target),
+    }
+
+
+def is_track_kept(later: Sequence[Sequence[MaskCoverage]], target: str) -> bool | None:
+    """Whether the prompt is on the target, in every view that shows it, soon after it was hidden.
+
+    `later` are the steps after that. Soon is the first or second prompted step in which the target
+    is visible; None where it never is, for the episode is over or the target out of view.
+    """
+    visible = []
+    for coverage in later:
+        showing = [view for view in coverage if view.pixels >= THRESHOLDS.pixels]
+        if showing:
+            visible.append(showing)
+    if not visible:
+        return None
+    return any(all(view.object == target for view in views) for views in visible[:CALLS])
+
+
+def hiding_lines(episodes: "pd.DataFrame") -> list[str]:
+    """How often the track was kept, by suite and method; none where nothing was hidden.
+
+    Its interval is over layouts where one returns, else Wilson's.
+    """
+    if "track_kept" not in episodes:
+        return []
+    lines = []
+    hidden = episodes[episodes["track_kept"].notna()]
+    for (name, method), part in hidden.groupby(["suite", "method"], sort=False):
+        kept = rate_over_layouts(part, "track_kept")
+        seconds = float(part["hidden_s"].iloc[0])
+        lines.append(f"{name} {method}: hidden for {seconds:.1f} s, track kept in {kept}")
+    return lines
+
+
+def switch_columns(episode: Episode) -> dict[str, Any]:
+    """What a results table keeps of an episode whose tint was switched; nothing of any other.
+
+    `switched_s` is when. `turned_s` is how long after it the gripper was nearer to the object that
+    is tinted now than to the target, across the table; None where it never was, and where it was so
+    already at the switch. `obeyed` says whether the robot touched that object afterwards.
+    """
+    switch = _switch(episode)
+    if switch is None:
+        return {}
+    first, rival = switch
+    frames = episode.frames[first:]
+    target = episode.header.row.target
+    robot = robots.get(suite(episode.header.row.suite).robot)
+    turned_s = None
+    for frame in frames:
+        if _away_m(robot, frame, rival) < _away_m(robot, frame, target):
+            if frame is not frames[0]:
+                turned_s = frame.timestamp_s - frames[0].timestamp_s
+            break
+    obeyed = any(rival in frame.truth.touched for frame in frames[1:])
+    return {"switched_s": frames[0].timestamp_s, "turned_s": turned_s, "obeyed": obeyed}
+
+
+def switching_lines(episodes: "pd.DataFrame") -> list[str]:
+    """What the robot did, by suite and method; of a table without such episodes nothing.
+
+    The interval of `obeyed` is over layouts where one returns, else Wilson's. Tables of earlier
+    versions have `turned_s` 0 where the gripper was nearer to the other object already at the
+    switch; that hand did not turn.
+    """
+    if "switched_s" not in episodes:
+        return []
+    lines = []
+    switched = episodes[episodes["switched_s"].notna()]
+    for (name, method), part in switched.groupby(["suite", "method"], sort=False):
+        turned = part["turned_s"].dropna().astype(float)
+        turned = turned[turned > 0]
+        obeyed = rate_over_layouts(part, "obeyed")
+        line = f"{name} {method}: switched in {len(part)} episodes, obeyed in {obeyed}"
+        if len(turned):
+            line += f"; the hand turned in {len(turned)}, "
+            line += f"median {turned.median():.1f} s after the switch"
+        lines.append(line)
+    return lines
+
+
+def _switch(episode: Episode) -> tuple[int, str] | None:
+    """The frame in which the tint was switched, and the object that it was switched to.
+
+    A switch in the last frame is none: no action follows it.
+    """
+    for i, frame in enumerate(episode.frames[:-1]):
+        for event in frame.events:
+            if event.text.startswith(SWITCHED):
+                return i, event.text.removeprefix(SWITCHED)
+    return None
+
+
+def _away_m(robot: Robot, frame: Frame, name: str) -> float:
+    """From the gripper to an object, across the table."""
+    from scipy.spatial.transform import Rotation
+
+    base_from_tcp = frame.state[:3].astype(float)
+    turn = Rotation.from_quat(robot.base_world[3:], scalar_first=True)
+    tcp_world = turn.apply(base_from_tcp) + robot.base_world[:3]
+    return float(np.hypot(*(tcp_world - frame.truth.objects_world[name][:3])[:2]))

@@ -1,0 +1,463 @@
+"""Remembers an object from photos as a person takes them, and says how far its vote can be trusted.
+
+A box is chosen in every photo, all are shown on a contact sheet, and a doubtful one stops it.
+"""
+
+import os.path
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from vap_core.base.errors import BadMemory, BadPhoto
+from vap_core.base.files import writing
+from vap_core.base.photos import load_mask, load_photo, photos_in
+from vap_core.base.types import PersonalObject, Rgb, value
+from vap_core.base.video import is_video, sharp_frames
+from vap_core.instruction.owners import fold
+from vap_core.memory import load, object_files, object_path, remember
+from vap_core.perception.boxes import mask_box
+from vap_core.perception.protocols import Encoder, Stack
+from vap_core.perception.references import (
+    LEAST_COSINE,
+    SMALL_PX,
+    Box,
+    Reference,
+    choose_references,
+    whole_photos,
+)
+from vap_core.perception.rows import embed_crops
+from vap_core.vote import similarity, vote
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
+
+LABEL_PX, COLUMNS = 34, 4
+GAP_PX = 10
+"""Between the tiles of a sheet of scenes, whose pictures would touch."""
+LARGEST_PX, SMALLEST_PX = 13, 10
+"""Sizes of a label's text, from that of a short one to that of a long one."""
+TRUTH, RIGHT, WRONG, SILENT = (255, 255, 255), (60, 200, 90), (235, 60, 50), (160, 160, 160)
+DOUBTFUL = (250, 180, 40)
+
+
+def join_tiles(tiles: Sequence[Rgb], columns: int = COLUMNS, gap_px: int = 0) -> Rgb:
+    """Tiles of one size in rows, on white; `gap_px` lie between two."""
+    height, width = tiles[0].shape[:2]
+    down, across = height + gap_px, width + gap_px
+    rows = -(-len(tiles) // columns)
+    shape = (rows * down - gap_px, min(columns, len(tiles)) * across - gap_px, 3)
+    out = np.full(shape, 255, np.uint8)
+    for i, tile in enumerate(tiles):
+        y, x = i // columns * down, i % columns * across
+        out[y : y + height, x : x + width] = tile
+    return out
+
+
+def fit(rgb: Rgb, width: int, height: int) -> tuple[Rgb, float]:
+    """The picture scaled to fit into a white tile, at its top left corner, and by how much."""
+    scale = min(width / rgb.shape[1], height / rgb.shape[0])
+    size = (max(1, round(rgb.shape[1] * scale)), max(1, round(rgb.shape[0] * scale)))
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    out = np.full((height, width, 3), 255, np.uint8)
+    small = cv2.resize(rgb, size, interpolation=method)
+    out[: small.shape[0], : small.shape[1]] = small
+    return out, scale
+
+
+def draw_box(rgb: Rgb, box: Sequence[float], colour: tuple[int, int, int], width: int) -> None:
+    """A box on `rgb`, in place, with a dark rim so that it shows on any ground."""
+    near = (round(box[0]), round(box[1]))
+    far = (round(box[2]) - 1, round(box[3]) - 1)
+    cv2.rectangle(rgb, near, far, (0, 0, 0), width + 2)
+    cv2.rectangle(rgb, near, far, colour, width)
+
+
+def labelled(rgb: Rgb, lines: Sequence[str]) -> Rgb:
+    """The picture with two lines of text below, which are made to fit its width."""
+    from PIL import Image, ImageDraw
+
+    label = Image.new("RGB", (rgb.shape[1], LABEL_PX), "white")
+    draw = ImageDraw.Draw(label)
+    for i, line in enumerate(lines):
+        text, size = fit_line(line, rgb.shape[1] - 8)
+        draw.text((4, 9 + 16 * i), text, fill="black", font=_font(size), anchor="lm")
+    return np.concatenate([rgb, np.asarray(label)])
+
+
+def fit_line(line: str, width: int) -> tuple[str, int]:
+    """The line and the size at which it is that wide at most: smaller, then without its middle."""
+    for size in range(LARGEST_PX, SMALLEST_PX - 1, -1):
+        if _font(size).getlength(line) <= width:
+            return line, size
+    for kept in range(len(line) - 1, 1, -1):
+        head = (kept + 1) // 2
+        shorter = f"{line[:head]}...{line[len(line) - kept + head :]}"
+        if _font(SMALLEST_PX).getlength(shorter) <= width:
+            return shorter, SMALLEST_PX
+    return "", SMALLEST_PX
+
+
+@cache
+def _font(size: int) -> "FreeTypeFont":
+    """Pillow's own font."""
+    from PIL import ImageFont
+
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont), "Pillow has FreeType"
+    return font
+
+
+def write_picture(path: Path, rgb: Rgb) -> None:
+    """Raises: BadOutput."""
+    from PIL import Image
+
+    with writing(path, "write_picture", "choose another folder"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rgb).save(path)
+
+
+CROP_SIDE = 512
+"""The longer side of a crop that is kept; the encoder looks at fewer pixels."""
+TILE_PX = 260
+
+
+def gather_photos(paths: Sequence[Path]) -> list[Path]:
+    """Picture files, each once; a folder gives its own in the order of their names.
+
+    Raises: BadPhoto.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not os.path.isdir(path):
+            found.append(path)
+            continue
+        inside = photos_in(path)
+        if not inside:
+            raise BadPhoto(f"register: {path} holds no picture; name a folder of photos.")
+        found.extend(inside)
+    once: dict[str, Path] = {}
+    for path in found:
+        once.setdefault(os.path.realpath(path), path)
+    return list(once.values())
+
+
+def film_photos(video: Path, folder: Path, count: int) -> list[Path]:
+    """The sharpest frames of a video, spread over it, as picture files in `folder`.
+
+    Raises: BadPhoto, BadOutput.
+    """
+    if not is_video(video):
+        raise BadPhoto(f"register: {video} is no video by its name; export it as MP4.")
+    paths = []
+    for i, rgb in enumerate(sharp_frames(video, count)):
+        path = folder / f"{video.stem}-{i + 1}.png"
+        write_picture(path, rgb)
+        paths.append(path)
+    return paths
+
+
+def parse_given(
+    boxes: Sequence[str], masks: Sequence[str], photos: Sequence[Path]
+) -> dict[int, Box]:
+    """The boxes of photos by their numbers, from "PHOTO=x0,y0,x1,y1" and "PHOTO=MASK".
+
+    Boxes are pixels of the upright photo; a mask is a picture of its size, bright on the object.
+
+    Raises: BadPhoto.
+    """
+    given = {}
+    for text in boxes:
+        number, words = _split(text, photos, "--box", "x0,y0,x1,y1")
+        given[number] = _parse_box(text, words)
+    for text in masks:
+        number, words = _split(text, photos, "--mask", "MASK.png")
+        given[number] = _box_of_mask(Path(words), photos[number])
+    return given
+
+
+def choose(
+    photos: Sequence[Path], category: str, stack: Stack, given: Mapping[int, Box], *, whole: bool
+) -> tuple[Reference, ...]:
+    """Read the photos and choose the box of each. Raises: BadPhoto, BadEncoder."""
+    if not photos:
+        raise BadPhoto("register: no photos; name picture files, a folder of them, or --video.")
+    pictures = [load_photo(photo, long_side=None) for photo in photos]
+    if whole and given:
+        raise BadPhoto("register: --whole uses photos as they are; leave --box and --mask out.")
+    if whole:
+        return whole_photos(pictures)
+    for number, box in given.items():
+        height, width = pictures[number].shape[:2]
+        if box[2] > width or box[3] > height or box[:2].min() < 0:
+            raise BadPhoto(
+                f"register: the box {box.astype(int).tolist()} is not inside {photos[number]}, "
+                f"which has {width}x{height} pixels when upright."
+            )
+    return choose_references(pictures, category, stack.detector, stack.encoder, given)
+
+
+def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], sheet: Path) -> None:
+    """Stop at crops that may be wrong, after writing their sheet.
+
+    Raises: BadPhoto, which names the sheet and the first photo whose crop may be wrong; BadOutput.
+    """
+    doubtful = [i for i, reference in enumerate(references) if reference.doubt]
+    if not doubtful:
+        return
+    write_sheet(sheet, references, photos)
+    first = doubtful[0]
+    name = _shortest_name(photos[first], photos)
+    more = ""
+    if len(doubtful) > 1:
+        more = f" ({len(doubtful) - 1} more are doubtful)"
+    raise BadPhoto(
+        f"register: {name}: {references[first].doubt}{more}; look at {sheet}, then give --box "
+        f"{shlex.quote(name)}=x0,y0,x1,y1 in pixels, or pass --accept."
+    )
+
+
+def remember_references(
+    name: str, category: str, references: Sequence[Reference], stack: Stack
+) -> PersonalObject:
+    """The object with the chosen crops. Raises: BadMemory, BadEncoder."""
+    crops = [fit_crop(reference.crop) for reference in references]
+    return remember(name, category, crops, stack.encoder)
+
+
+def fit_crop(crop: Rgb) -> Rgb:
+    """A crop of at most CROP_SIDE pixels."""
+    import cv2
+
+    scale = CROP_SIDE / max(crop.shape[:2])
+    if scale >= 1:
+        return crop
+    size = (max(1, round(crop.shape[1] * scale)), max(1, round(crop.shape[0] * scale)))
+    return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+
+
+def write_sheet(path: Path, references: Sequence[Reference], photos: Sequence[Path]) -> None:
+    """A picture of every photo with its box, and of its crop beside it. Raises: BadOutput."""
+    tiles = []
+    for photo, reference in zip(photos, references, strict=True):
+        shown, scale = fit(reference.photo, TILE_PX, TILE_PX)
+        colour = DOUBTFUL if reference.doubt else RIGHT
+        draw_box(shown, (scale * reference.box).tolist(), colour, 2)
+        crop, _ = fit(reference.crop, TILE_PX, TILE_PX)
+        verdict = reference.doubt or describe_choice(reference)
+        tiles.append(labelled(np.concatenate([shown, crop], axis=1), [photo.name, verdict]))
+    write_picture(path, join_tiles(tiles, columns=2))
+
+
+def describe_choice(reference: Reference) -> str:
+    """How a box that is not doubtful was chosen."""
+    if reference.chosen_by == "given":
+        return "box given by hand"
+    if reference.chosen_by == "whole":
+        return "used whole"
+    if np.isnan(reference.agreement):
+        return "box proposed; the only photo"
+    return f"box proposed; cosine {reference.agreement:.2f} to the other photos"
+
+
+def load_others(memory: Path, name: str) -> tuple[dict[str, PersonalObject], tuple[BadMemory, ...]]:
+    """The objects of a memory besides `name`, and an error for each that cannot be loaded.
+
+    The file of `name` itself is not read: it may be damaged, and is to be replaced.
+
+    Raises: BadMemory: the folder cannot be read.
+    """
+    known = {}
+    errors = []
+    for path in object_files(memory):
+        if path == object_path(memory, name):
+            continue
+        try:
+            obj = load(path)
+        except BadMemory as error:
+            errors.append(error)
+        else:
+            known[obj.name] = obj
+    return known, tuple(errors)
+
+
+def next_words(
+    obj: PersonalObject, memory: Path, stack: str, others: Mapping[str, PersonalObject]
+) -> list[str]:
+    """The command that grounds an object which was just registered beside `others`."""
+    words = ["ground", "IMAGE", f"bring my {obj.category}", "--memory", str(memory)]
+    if stack != "embedded":
+        words += ["--stack", stack]
+    if obj.owner:
+        words += ["--speaker", obj.owner]
+    for other in others.values():
+        if other.category == obj.category and fold(other.owner) == fold(obj.owner):
+            return [*words, "--object", obj.name]
+    return words
+
+
+def _split(text: str, photos: Sequence[Path], option: str, form: str) -> tuple[int, str]:
+    """The photo's number and the rest of "PHOTO=REST"; both may hold "=", too."""
+    photo = ""
+    for path in photos:
+        for known in (str(path), path.name):
+            if text.startswith(f"{known}=") and len(known) > len(photo):
+                photo = known
+    fitting = []
+    for i, path in enumerate(photos):
+        if photo in (str(path), path.name):
+            fitting.append(i)
+    words = text[len(photo) :].removeprefix("=")
+    if not photo and "=" not in words and len(photos) == 1:
+        fitting = [0]
+    if len(fitting) != 1:
+        names = [shlex.quote(_shortest_name(path, photos)) for path in photos[:6]]
+        known = ", ".join(names)
+        raise BadPhoto(
+            f"register: {option} {text!r} names no single photo; write {option} PHOTO={form} with "
+            f"one of {known}."
+        )
+    return fitting[0], words
+
+
+def _shortest_name(photo: Path, photos: Sequence[Path]) -> str:
+    """A photo's file name; its path where another has the same name."""
+    alike = [path for path in photos if path.name == photo.name]
+    return photo.name if len(alike) == 1 else str(photo)
+
+
+def _box_of_mask(mask_path: Path, photo: Path) -> Box:
+    """Around what is bright in a mask of the photo's size. Raises: BadPhoto."""
+    mask = load_mask(mask_path)
+    height, width = load_photo(photo, long_side=None).shape[:2]
+    if mask.shape != (height, width):
+        raise BadPhoto(
+            f"register: the mask {mask_path} has {mask.shape[1]}x{mask.shape[0]} pixels, its photo "
+            f"{width}x{height}; save it as large as the upright photo."
+        )
+    box = mask_box(mask)
+    if box is None:
+        raise BadPhoto(f"register: the mask {mask_path} is dark all over; paint the object white.")
+    return box
+
+
+def _parse_box(text: str, words: str) -> Box:
+    try:
+        x0, y0, x1, y1 = map(float, words.split(","))
+    except ValueError as error:
+        raise BadPhoto(
+            f"register: --box {text!r} is not PHOTO=x0,y0,x1,y1; for example --box "
+            "mug-1.jpg=40,60,180,220."
+        ) from error
+    if not (np.isfinite([x0, y0, x1, y1]).all() and x1 - x0 >= 1 and y1 - y0 >= 1):
+        raise BadPhoto(
+            f"register: --box {text!r} has no area; x to the right, y down, far corner last."
+        )
+    return np.array([x0, y0, x1, y1], np.float32)
+
+
+FEWEST = 3
+"""References that are needed before one can be left out."""
+
+
+@value
+class Trust:
+    """Leave-one-out over K references: each in turn is a candidate, and the others vote.
+
+    `right` counts the references that win against all rivals, `margin` is the least cosine by which
+    one is ahead. Rivals are the crops of `others` remembered objects and `background` crops of the
+    reference photos. `by_name` has the remembered objects that beat a reference.
+    """
+
+    right: int
+    n: int
+    margin: float
+    others: int
+    background: int
+    by_name: tuple[str, ...]
+
+    def __str__(self) -> str:
+        if self.n < FEWEST:
+            return f"vote not checked: {self.n} references; give {FEWEST} or more, five are best"
+        if not self.others + self.background:
+            return "vote not checked: nothing else is remembered, and the photos show nothing else"
+        text = (
+            f"vote: each photo left out in turn, {self.right} of {self.n} are elected by the "
+            f"others against {self.others} crops of other objects and {self.background} of the "
+            f"background; least lead in cosine {self.margin:.2f}"
+        )
+        if self.by_name:
+            text += f"; mistaken for {', '.join(self.by_name)}"
+        if self.right < self.n:
+            text += "; more photos, from all sides, or tighter crops help"
+        return text
+
+
+def leave_one_out(
+    obj: PersonalObject,
+    references: Sequence[Reference],
+    bank: Mapping[str, PersonalObject],
+    encoder: Encoder,
+) -> Trust:
+    """Elect each reference by the others among the crops of the bank and of the background."""
+    background: list[Rgb] = []
+    for reference in references:
+        background.extend(reference.others)
+    rows = [embed_crops("remember", encoder, background)]
+    names = [""] * len(background)
+    for other in bank.values():
+        if other.name != obj.name and other.encoder == obj.encoder:
+            rows.append(other.embeddings)
+            names += [other.name] * len(other.embeddings)
+    rivals = np.concatenate(rows)
+    right, margins, beaten_by = 0, [], []
+    n = len(obj.embeddings)
+    if n >= FEWEST and len(rivals):
+        for k in range(n):
+            others = np.delete(obj.embeddings, k, axis=0)
+            candidates = np.concatenate([obj.embeddings[k : k + 1], rivals])
+            cosine = similarity(candidates, others)
+            winner = vote(cosine).winner
+            assert winner is not None
+            mean = cosine.mean(axis=1)
+            margins.append(float(mean[0] - mean[1:].max()))
+            right += winner == 0
+            if winner and names[winner - 1]:
+                beaten_by.append(names[winner - 1])
+    return Trust(
+        right=right,
+        n=n,
+        margin=min(margins, default=float("nan")),
+        others=len(rivals) - len(background),
+        background=len(background),
+        by_name=tuple(sorted(set(beaten_by))),
+    )
+
+
+def warnings(
+    obj: PersonalObject, references: Sequence[Reference], names: Sequence[str]
+) -> list[str]:
+    """What is wrong with references that are used all the same, one line each."""
+    lines = []
+    for name, reference in zip(names, references, strict=True):
+        height, width = reference.crop.shape[:2]
+        if min(height, width) < SMALL_PX:
+            lines.append(
+                f"{name}: the object is only {width}x{height} pixels; go nearer, or take more "
+                "pixels"
+            )
+    cosine = obj.embeddings @ obj.embeddings.T
+    k = len(cosine)
+    for i, name in enumerate(names):
+        if k > 1:
+            to_others = float((cosine[i].sum() - cosine[i, i]) / (k - 1))
+            if to_others < LEAST_COSINE:
+                lines.append(
+                    f"{name}: unlike the other references (mean cosine {to_others:.2f}); is it "
+                    "the same object?"
+                )
+    return lines

@@ -1,0 +1,748 @@
+"""Learns the token of every personal object from few or many photos, and measures it as it grows.
+
+A job is one training: of one task's target, from so many photos, in the vision-language model or
+in the policy's own weights. Afterwards a token that was learned in the model is read by the policy,
+copied as it is and rotated into the policy's space, and the model chooses by it among the objects
+of listed episodes, each cut out by its true mask. Every object has one learned token: intervals and
+p values take objects, not episodes, as the independent units.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core.base.errors import BadOutput, BadStudy, one_of
+from vap_core.base.files import write_atomic, writing
+from vap_core.base.parquet import read_parquet
+from vap_core.base.tables import align as text_table
+from vap_core.base.types import Mask, Rgb, value
+from vap_core.perception.boxes import mask_box
+from vap_core.policies.lerobot.checkpoints import fingerprint
+from vap_core.policies.mini_pi0 import teach_token
+from vap_core.policies.mini_pi0.learned_token import (
+    Photos,
+    TokenTraining,
+    answers,
+    lessons,
+    recognized,
+)
+from vap_core.policies.mini_pi0.token_alignment import align
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.simulation.studio import reference_views
+from vap_core.study import store
+from vap_core.study.engine import spread_evenly
+from vap_core.study.perception import opening_views
+from vap_core.study.processes import results
+from vap_core.study.stats import Estimate, Rate, bootstrap_interval, holm, rate, share_by, sign_flip
+from vap_core.study.trials import Study, shipped
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vap_core.policies.mini_pi0.vlm import MiniVlm
+
+CALLER = "measure tokens"
+KS = (1, 3, 5, 7)
+"""Numbers of photos to learn from."""
+USUAL_K = teach_token.K
+SHARES = (0.05, 0.15, 0.3, 0.5, 1.0)
+"""Shares of a training after which the token is measured, besides before its first step."""
+OTHER = "other objects"
+TABLES = ("answers", "embeddings", "choices")
+"""Kinds of parts: photos to which the answer was yes; what was learned; scores of the objects of
+episodes."""
+TRAINING = ["suite", "task", "k", "learned_in", "epochs"]
+"""The columns that name one training."""
+NOT_KEY = ("yes", "n", "embedding", "views", "score")
+Place = Literal["vlm", "policy"]
+PLACES: tuple[Place, ...] = ("vlm", "policy")
+"""Where a token is learned: in the model, or in the policy's own weights."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """What is asked for: the suites, numbers of photos, epochs of a training, and where.
+
+    Raises: UnknownName for a place that is none of PLACES, or a suite that is no benchmark;
+        BadStudy for a suite for which no mini-pi0 ships.
+    """
+
+    suites: tuple[str, ...] = tuple(suites.BENCHMARKS)
+    ks: tuple[int, ...] = KS
+    epochs: int = TokenTraining().epochs
+    places: tuple[str, ...] = PLACES
+
+    def __post_init__(self) -> None:
+        for place in self.places:
+            if place not in PLACES:
+                raise one_of("measure tokens: --learn-in", place, PLACES)
+        for name in self.suites:
+            if name not in suites.BENCHMARKS:
+                raise one_of("measure tokens: suite", name, suites.BENCHMARKS)
+            if not shipped(name).is_dir():
+                raise BadStudy(
+                    f"measure tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
+                    f"policy --suite {name}"
+                )
+
+    def configuration(self) -> dict[str, Any]:
+        """What the results depend on, as JSON; suites and numbers of photos may be added to.
+
+        Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadSuite,
+            MissingWeights, as `Study.configuration`.
+        """
+        policies = {name: fingerprint(shipped(name)) for name in suites.BENCHMARKS}
+        models = {name: _model(_model_folder(name)).sha256() for name in suites.BENCHMARKS}
+        tasks = suites.tasks_of(suites.BENCHMARKS)
+        shown = Study(tasks=tasks, methods=("generic",), policy="expert").configuration()
+        return {
+            "survey": "tokens",
+            "epochs": self.epochs,
+            "views": teach_token.VIEWS,
+            "vlms": models,
+            "policies": policies,
+            **{name: shown[name] for name in ("version", "lists", "world")},
+        }
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training: `where` the token is learned, from `k` photos."""
+
+    suite: str
+    task: str
+    k: int
+    where: Place
+    epochs: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.suite}.{self.task}.{self.where}.{self.k}"
+
+
+def plan(asked: Tokens) -> list[Job]:
+    """Every job: the usual number of photos of every object first."""
+    jobs = []
+    usual = [k for k in asked.ks if k == USUAL_K]
+    for ks in (usual, [k for k in asked.ks if k != USUAL_K]):
+        for suite in asked.suites:
+            for task in suites.suite(suite).tasks:
+                for k in ks:
+                    for place in PLACES:
+                        if place in asked.places and (place == "vlm" or k == USUAL_K):
+                            jobs.append(Job(suite, task.name, k, place, asked.epochs))
+    return jobs
+
+
+def run_job(job: Job) -> dict[str, list[Row]]:
+    """Learn one token, and return the rows of every table.
+
+    Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadMemory when a kind
+        of photo is missing; BadSuite for a damaged list.
+    """
+    from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
+
+    target = suites.rows(job.suite, job.task, 1)[0].target
+    taught = _photos(job.suite, job.task, 0, job.k)
+    shown = _shown(job.suite, job.task)
+    policy_folder, model_folder = shipped(job.suite), _model_folder(job.suite)
+    teacher = _model(model_folder) if job.where == "vlm" else _policy_model(job.suite)
+    training = TokenTraining(epochs=job.epochs)
+    about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
+    about |= {"learned_in": job.where, "epochs": job.epochs}
+    answers: list[Row] = []
+    chosen: list[Row] = []
+    with fused_attention():
+        measured = _measured_epochs(job.epochs)
+        for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
+            if epoch in measured:
+                where = {**about, "step": step, "token": "as learned", "read_by": job.where}
+                answers += _answers(where, teacher, embedding, shown)
+        where = {**about, "token": "as learned", "read_by": job.where}
+        views = scenes(job.suite, job.task)
+        for name, part in (
+            (SCENE, views),
+            (PHOTO, in_photos(views, shown)),
+        ):
+            chosen += scores({**where, "seen_in": name}, teacher, embedding, part)
+        if job.where == "vlm":
+            reader = _policy_model(job.suite)
+            aligned = align(embedding, model_folder, policy_folder)
+            for token, read in (("copied", embedding), ("aligned", aligned)):
+                where = {**about, "step": step, "token": token, "read_by": "policy"}
+                answers += _answers(where, reader, read, shown)
+    learned = {**about, "step": step, "embedding": embedding.tolist()}
+    return {"answers": answers, "embeddings": [learned], "choices": chosen}
+
+
+def run(
+    asked: Tokens, folder: Path, *, workers: int = 1, progress: bool = True
+) -> "dict[str, pd.DataFrame]":
+    """Do what `folder` lacks, and return the tables.
+
+    Raises: BadOutput when the folder holds another run, is in use or cannot be written; BadStudy
+        when nothing is asked for; WorkerDied.
+    """
+    from tqdm import tqdm
+
+    jobs = plan(asked)
+    if not jobs:
+        raise BadStudy(
+            f"measure tokens: in the policy a token is learned from {USUAL_K} photos alone; ask "
+            f"for --k {USUAL_K}, or for --learn-in vlm."
+        )
+    store.open_run(folder, asked.configuration())
+    with store.locked(folder):
+        done = folder / "done"
+        with writing(folder, CALLER):
+            done.mkdir(exist_ok=True)
+        missing = [job for job in jobs if not _is_done(folder, job)]
+        with tqdm(
+            total=len(jobs),
+            initial=len(jobs) - len(missing),
+            unit="token",
+            disable=not progress,
+        ) as bar:
+            for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
+                parts = []
+                for name, rows in tables.items():
+                    part = store.write_part(folder, name, rows, caller=CALLER)
+                    parts.append(f"{part.relative_to(folder)}\n")
+                with writing(folder, CALLER):
+                    write_atomic(done / job.name, "".join(parts).encode())
+                bar.update()
+    return read(folder)
+
+
+def _is_done(folder: Path, job: Job) -> bool:
+    """Whether a training has ended and every part that it wrote is still there.
+
+    It wrote some: a file that names none was not written to its end.
+    """
+    try:
+        parts = (folder / "done" / job.name).read_text().splitlines()
+    except OSError:
+        return False
+    return bool(parts) and all((folder / part).exists() for part in parts)
+
+
+def read(folder: Path) -> "dict[str, pd.DataFrame]":
+    """The tables of a run, as far as it is. Raises: BadOutput."""
+    import pandas as pd
+
+    tables = {}
+    for name in TABLES:
+        parts = []
+        for path in sorted((folder / name).glob("*.parquet")):
+            remedy = "delete it and run the same command again"
+            parts.append(read_parquet(path, "measure tokens", remedy))
+        if not parts:
+            raise BadOutput(
+                f"measure tokens: {folder} holds no {name}; run the same command again to finish "
+                "it."
+            )
+        whole = pd.concat(parts, ignore_index=True)
+        key = [column for column in whole.columns if column not in NOT_KEY]
+        # A run that was killed between two files has written one of them twice.
+        whole = whole.drop_duplicates(key, ignore_index=True)
+        tables[name] = whole.sort_values(key, ignore_index=True)
+    return tables
+
+
+def publish(folder: Path, to: Path) -> list[Path]:
+    """Keep the tables in `to` as token_NAME.parquet, with the configurations of their runs.
+
+    Trainings that `to` holds and the run does not stay there. Raises: BadOutput.
+    """
+    manifest = store.read_manifest(folder)
+    tables = {}
+    for name, table in read(folder).items():
+        path = to / f"token_{name}.parquet"
+        tables[path.name] = store.add_rows(path, table, TRAINING, {b"runs": manifest})
+    return store.publish_tables(tables, to, caller="measure tokens")
+
+
+def _measured_epochs(epochs: int) -> set[int]:
+    """After how many epochs a token is measured."""
+    return {0, *(max(1, round(share * epochs)) for share in SHARES)}
+
+
+def _answers(
+    about: Row,
+    reader: "MiniVlm",
+    embedding: Float32[np.ndarray, " d"],
+    shown: Mapping[str, Sequence[Rgb]],
+) -> Iterator[Row]:
+    """A row per object of the photos: to how many of them the reader says yes."""
+    for name, photos in shown.items():
+        yes = recognized(reader, embedding, photos)
+        yield {**about, "shown": name, "yes": int(yes.sum()), "n": len(yes)}
+
+
+@lru_cache(maxsize=4)
+def _negatives(
+    suite: str, task: str, seed: int
+) -> tuple[dict[str, tuple[Rgb, ...]], tuple[Rgb, ...]]:
+    """Photos of every look-alike of a task's target, and of other objects."""
+    rows = suites.rows(suite, task)
+    rivals = {}
+    for name in teach_token.lookalikes(rows):
+        rivals[name] = tuple(reference_views(get_object(name), teach_token.VIEWS, seed))
+    return rivals, teach_token.other_objects(rows, seed)
+
+
+def _photos(suite: str, task: str, seed: int, k: int) -> Photos:
+    """What teach_token.photographs takes, with the negatives rendered once."""
+    target = get_object(suites.rows(suite, task, 1)[0].target)
+    rivals, others = _negatives(suite, task, seed)
+    photos: list[Rgb] = []
+    for views in rivals.values():
+        photos += views
+    return Photos(tuple(reference_views(target, k, seed)), tuple(photos), others)
+
+
+def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
+    """Photos that no training saw, by the object that they show; the target's first."""
+    photos = _photos(suite, task, 1, teach_token.VIEWS)
+    target = suites.rows(suite, task, 1)[0].target
+    rivals, others = _negatives(suite, task, 1)
+    return {target: photos.own, **rivals, OTHER: others}
+
+
+def _model_folder(suite: str) -> Path:
+    """The shipped model that a suite's policy grew from."""
+    return teach_token.model_of_policy(shipped(suite))
+
+
+@lru_cache(maxsize=2)
+def _model(folder: Path) -> "MiniVlm":
+    from vap_core.policies.mini_pi0.vlm import load_vlm
+
+    return load_vlm(folder)
+
+
+@lru_cache(maxsize=1)
+def _policy_model(suite: str) -> "MiniVlm":
+    from vap_core.policies.mini_pi0.vlm import load_from_policy
+
+    return load_from_policy(shipped(suite))
+
+
+EPISODES = 48
+"""Episodes of a suite, spread evenly over its tasks."""
+SIZE = 448
+"""Pixels along the edges of a view, four times what a policy reads."""
+FILL = 0.55
+"""The object's share of a crop's edge, as in a reference photo."""
+KEY = ["suite", "task", "episode"]
+"""What names an episode of a list."""
+SCENE, PHOTO = "scene", "photo"
+"""What the objects are seen in: the column `seen_in`."""
+IN_PHOTOS, IN_SCENE = "model, in photos", "model, in the scene"
+AFTER_RIGHT = "soft, where the model is right"
+AFTER_WRONG = "soft, where it is wrong"
+"""Columns of `beside_policy` beside the methods."""
+ALL_SUITES = "all suites"
+OBJECTS = ("object",)
+"""What tells independent units apart."""
+TO_SCENE, TO_POLICY = "photo to scene", "scene to policy"
+"""Steps at which an object is lost, the rows of `losses`."""
+
+
+@value
+class Scene:
+    """An episode's objects of the target's category, each as its crops from the first views."""
+
+    episode: int
+    target: str
+    crops: Mapping[str, tuple[Rgb, ...]]
+
+
+def photo_crop(rgb: Rgb, mask: Mask) -> Rgb | None:
+    """The square around an object of which it fills FILL; None where it is not in view.
+
+    Beyond the view its edge is repeated.
+    """
+    box = mask_box(mask)
+    if box is None:
+        return None
+    x0, y0, x1, y1 = box.tolist()
+    side = max(8, round(max(x1 - x0, y1 - y0) / FILL))
+    left = round((x0 + x1 - side) / 2)
+    top = round((y0 + y1 - side) / 2)
+    padded = cv2.copyMakeBorder(rgb, side, side, side, side, cv2.BORDER_REPLICATE)
+    return padded[top + side : top + 2 * side, left + side : left + 2 * side].copy()
+
+
+@lru_cache(maxsize=1)
+def scenes(suite: str, task: str) -> tuple[Scene, ...]:
+    """The first views of a task's share of EPISODES, cut into objects.
+
+    Raises: UnknownName for a suite or a task that no registry holds; BadSuite for a damaged list.
+    """
+    n = max(1, EPISODES // len(suites.suite(suite).tasks))
+    found = []
+    for views in opening_views(spread_evenly(suites.rows(suite, task), n), SIZE):
+        row = views[0].row
+        crops: dict[str, list[Rgb]] = {}
+        for view in views:
+            for name, mask in view.visible().items():
+                crop = photo_crop(view.rgb, mask)
+                if get_object(name).category == row.category and crop is not None:
+                    crops.setdefault(name, []).append(crop)
+        kept = {name: tuple(pictures) for name, pictures in crops.items()}
+        found.append(Scene(episode=row.episode, target=row.target, crops=kept))
+    return tuple(found)
+
+
+def in_photos(shown: Sequence[Scene], photos: Mapping[str, Sequence[Rgb]]) -> tuple[Scene, ...]:
+    """The same episodes with as many unseen photos of every object in place of its crops.
+
+    What the model chooses there and in the scene differs by what it sees, not by what it is asked.
+    """
+    found = []
+    for i, scene in enumerate(shown):
+        drawn = {}
+        for name, crops in scene.crops.items():
+            of_object = photos[name]
+            first = i * len(crops)
+            drawn[name] = tuple(of_object[(first + j) % len(of_object)] for j in range(len(crops)))
+        found.append(Scene(episode=scene.episode, target=scene.target, crops=drawn))
+    return tuple(found)
+
+
+def scores(
+    about: Mapping[str, Any],
+    reader: "MiniVlm",
+    embedding: Float32[np.ndarray, " d"],
+    shown: Sequence[Scene],
+) -> Iterator[dict[str, Any]]:
+    """A row per episode and object: by how much yes scores above no, as a mean over its views."""
+    for scene in shown:
+        for name, crops in scene.crops.items():
+            score = float(answers(reader, embedding, crops).mean())
+            where = {"episode": scene.episode, "shown": name, "views": len(crops)}
+            yield {**about, **where, "score": score}
+
+
+def chosen(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per episode: whether the highest score is the target's alone, and chance.
+
+    `table` has the rows of `scores` of one reading and one training of each object's word. Episodes
+    whose target no view shows count as wrong.
+
+    Raises: BadStudy for rows of several trainings.
+    """
+    import pandas as pd
+
+    if table.duplicated([*KEY, "object", "shown"]).any():
+        raise BadStudy(
+            "tokens: the rows are of several trainings of one word; choose one by k, epochs and "
+            "the reading."
+        )
+    rows = []
+    for key, group in table.groupby([*KEY, "object"], observed=True, sort=False):
+        is_target = group["shown"] == group["object"]
+        best = group["score"] == group["score"].max()
+        line = dict(zip([*KEY, "object"], key, strict=True))
+        line["right"] = bool(best[is_target].any() and best.sum() == 1)
+        line["chance"] = float(is_target.any()) / len(group)
+        rows.append(line)
+    return pd.DataFrame(rows, columns=[*KEY, "object", "right", "chance"])
+
+
+def beside_policy(
+    table: "pd.DataFrame", episodes: "pd.DataFrame", methods: Sequence[str]
+) -> "pd.DataFrame":
+    """The model's choices, and what a policy touches first in the same episodes, by suite.
+
+    `table` has the rows of `scores` of one reading, of SCENE and of PHOTO; `episodes` are those of
+    a published table, whose methods are columns. A row per suite and, if there are several, one for
+    ALL_SUITES; shares are `Estimate`s with intervals over objects. The last two columns are soft's
+    first touches where the model's choice in the scene was right, and where it was not.
+    """
+    import pandas as pd
+
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    joined = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    first = episodes.pivot_table(
+        index=KEY, columns="method", values="first_object_correct", aggfunc="first", observed=True
+    )
+    joined = joined.merge(first.reset_index(), on=KEY)
+    lines = {}
+    for name, part in _parts(joined):
+        line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
+        line[IN_PHOTOS] = share_by(part, "right_photo", OBJECTS)
+        line[IN_SCENE] = share_by(part, "right", OBJECTS)
+        for method in methods:
+            line[method] = share_by(part, method, OBJECTS)
+        line[AFTER_RIGHT] = share_by(part[part["right"]], "soft", OBJECTS)
+        line[AFTER_WRONG] = share_by(part[~part["right"]], "soft", OBJECTS)
+        lines[name] = line
+    return pd.DataFrame(lines).T
+
+
+def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """What is lost at TO_SCENE and at TO_POLICY, by suite.
+
+    `table` and `episodes` are `beside_policy`'s. A row per step and suite, and one for ALL_SUITES
+    if there are several: `loss` is an `Estimate` over `objects`, `p` the exact test that an object
+    is as likely to win as to lose (`sign_flip`), `p_holm` is `p` corrected for the suites of a
+    step; that of ALL_SUITES is `p`.
+    """
+    import pandas as pd
+
+    rows = []
+    steps = {TO_SCENE: _gains_of_photos(table), TO_POLICY: _gains_of_scene(table, episodes)}
+    for step, gains in steps.items():
+        of_step: list[dict[str, Any]] = []
+        for suite, part in _parts(gains):
+            by_object = _by_object(part)
+            line = {"step": step, "suite": suite, "objects": len(by_object)}
+            p = sign_flip(by_object["sum"].to_numpy(float))
+            of_step.append({**line, "loss": _mean_gain(part), "p": p, "p_holm": p})
+        single = [line for line in of_step if line["suite"] != ALL_SUITES]
+        for line, p_holm in zip(single, holm([line["p"] for line in single]), strict=True):
+            line["p_holm"] = p_holm
+        rows += of_step
+    return pd.DataFrame(rows).set_index(["step", "suite"])
+
+
+def _parts(joined: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
+    """The episodes of each suite; all of them at the end where there are several suites."""
+    parts = [(str(name), part) for name, part in joined.groupby("suite", sort=False)]
+    if len(parts) > 1:
+        parts.append((ALL_SUITES, joined))
+    return parts
+
+
+def _gains_of_photos(table: "pd.DataFrame") -> "pd.DataFrame":
+    """By how much an episode is right in photos more than in the scene: -1, 0 or 1."""
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
+    return both.assign(gain=both["right_photo"].astype(float) - both["right"].astype(float))
+
+
+def _gains_of_scene(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """By how much an episode is right in the scene more than in soft's first touch, likewise."""
+    soft = episodes[episodes["method"] == "soft"][[*KEY, "first_object_correct"]]
+    both = chosen(table[table["seen_in"] == SCENE]).merge(soft, on=KEY)
+    touched = both["first_object_correct"].astype(float)
+    return both.assign(gain=both["right"].astype(float) - touched)
+
+
+def _by_object(gains: "pd.DataFrame") -> "pd.DataFrame":
+    """The sum of an object's gains, and the number of its episodes."""
+    return gains.groupby(["suite", "object"], sort=True, observed=True)["gain"].agg(["sum", "size"])
+
+
+def _mean_gain(gains: "pd.DataFrame") -> Estimate:
+    """The mean gain of episodes; its interval resamples objects with all their episodes."""
+    by_object = _by_object(gains)
+    low, high = bootstrap_interval(
+        by_object["sum"].to_numpy(float), by_object["size"].to_numpy(float)
+    )
+    return Estimate(value=float(gains["gain"].mean()), low=low, high=high, n=len(gains))
+
+
+KINDS = ("own", "look-alikes", "other objects")
+READINGS = {
+    "as learned": ("vlm", "as learned", "vlm"),
+    "copied into the policy": ("vlm", "copied", "policy"),
+    "rotated into the policy": ("vlm", "aligned", "policy"),
+    "learned in the policy": ("policy", "as learned", "policy"),
+}
+"""Where a token is learned, which form of it is read, and by whom."""
+NOTE = (
+    "yes, % of photos that no training saw [95 % Wilson interval] n; right: as many photos of the "
+    "object as of others, each kind with half of the weight (no interval: it is of two rates). The "
+    "paper asks for more than 95 % right. Photos of one object are not independent of each other: "
+    "intervals over objects would be wider. What the model chooses has its interval over objects, "
+    "of which each has one token."
+)
+
+
+def kind_of(table: "pd.DataFrame") -> "pd.Series":
+    """Of every row, whether its photos show the object itself, a look-alike, or another."""
+    kinds = table.shown.map({OTHER: "other objects"}).fillna("look-alikes")
+    return kinds.where(table.shown != table.object, "own")
+
+
+def final(answers: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows after the last step of each training."""
+    training = answers.groupby(["object", "k", "learned_in"]).step
+    return answers[answers.step == training.transform("max")]
+
+
+def reading(answers: "pd.DataFrame", name: str) -> "pd.DataFrame":
+    """The rows of one of READINGS."""
+    learned_in, token, read_by = READINGS[name]
+    return answers[
+        (answers.learned_in == learned_in) & (answers.token == token) & (answers.read_by == read_by)
+    ]
+
+
+def said_yes(rows: "pd.DataFrame") -> Rate:
+    """The share of the rows' photos to which the answer was yes."""
+    return rate(int(rows.yes.sum()), int(rows.n.sum()))
+
+
+def right(rows: "pd.DataFrame") -> float:
+    """The share of right answers, the object's photos and all others with equal weight."""
+    is_own = kind_of(rows) == "own"
+    return (said_yes(rows[is_own]).value + 1 - said_yes(rows[~is_own]).value) / 2
+
+
+def curve(answers: "pd.DataFrame") -> "pd.DataFrame":
+    """By number of photos and step: yes to each kind of photo, over all objects of the rows.
+
+    Columns: k, step, kind, objects, n, yes, low, high.
+    """
+    import pandas as pd
+
+    rows = reading(answers, "as learned")
+    lines = []
+    for (k, step, kind), part in rows.groupby(["k", "step", kind_of(rows)]):
+        found = said_yes(part)
+        lines.append((k, step, kind, part.object.nunique(), *_numbers(found)))
+    return pd.DataFrame(lines, columns=["k", "step", "kind", "objects", "n", "yes", "low", "high"])
+
+
+def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+    """By object and reading: right, and yes to each kind of photo as `Rate`s."""
+    import pandas as pd
+
+    ends = final(answers)
+    ends = ends[ends.k == k]
+    lines = []
+    for name in READINGS:
+        for (suite, obj), part in reading(ends, name).groupby(["suite", "object"], sort=False):
+            kinds = kind_of(part)
+            rates = {kind: said_yes(part[kinds == kind]) for kind in KINDS}
+            lines.append({"suite": suite, "object": obj, "reading": name, "right": right(part)})
+            lines[-1] |= rates
+    return pd.DataFrame(lines, columns=["suite", "object", "reading", "right", *KINDS])
+
+
+def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+    """By reading, over all objects: right as a mean over objects, yes to each kind of photo.
+
+    All are `Estimate`s: yes has Wilson's interval over photos, right has Student's over objects.
+    """
+    import pandas as pd
+
+    ends = final(answers)
+    ends = ends[ends.k == k]
+    lines = []
+    for name in READINGS:
+        part = reading(ends, name)
+        if part.empty:
+            continue
+        kinds = kind_of(part)
+        of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
+        line = {"reading": name, "right": mean_of_tokens(of_objects)}
+        for kind in KINDS:
+            found = said_yes(part[kinds == kind])
+            line[kind] = Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
+        lines.append(line)
+    return pd.DataFrame(lines, columns=["reading", "right", *KINDS]).set_index("reading")
+
+
+def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+    """By object and look-alike: the share of its photos that are taken for the object's."""
+    import pandas as pd
+
+    ends = final(reading(answers, "as learned"))
+    ends = ends[(ends.k == k) & (kind_of(ends) == "look-alikes")]
+    lines = []
+    for row in ends.itertuples():
+        lines.append((row.suite, row.object, row.shown, *_numbers(rate(row.yes, row.n))))
+    columns = ["suite", "object", "look-alike", "n", "yes", "low", "high"]
+    return pd.DataFrame(lines, columns=columns)
+
+
+def success_by_token(episodes: "pd.DataFrame", other: str, one: str = "soft") -> "pd.Series":
+    """By task, how much more often `other` succeeds than `one` in the episodes that both ran.
+
+    A task has one target, and so one learned token of each form: tasks are the independent units.
+    """
+    key = ["suite", "task", "episode"]
+    wide = episodes.pivot(index=key, columns="method", values="success")[[one, other]].dropna()
+    gain = wide[other].astype(float) - wide[one].astype(float)
+    return gain.groupby(["suite", "task"], sort=False).mean()
+
+
+def mean_of_tokens(values: Sequence[float], least: float = 0.0) -> Estimate:
+    """The mean of one value per token with Student's 95 % interval, inside `least` to 1.
+
+    A single token has no interval. `least` is -1 for differences.
+    """
+    import numpy as np
+    from scipy import stats
+
+    n = len(values)
+    middle = float(np.mean(values))
+    if n < 2:
+        return Estimate(value=middle, low=float("nan"), high=float("nan"), n=n)
+    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+    return Estimate(value=middle, low=max(least, middle - half), high=min(1.0, middle + half), n=n)
+
+
+def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
+    """What the command prints."""
+    answers = tables["answers"]
+    found = readings(answers)
+    rows = [["object", "token", "right, %", *(f"yes to {kind}" for kind in KINDS)]]
+    for line in found.to_dict("records"):
+        cells = [str(line["object"]), str(line["reading"]), f"{100 * line['right']:.1f}"]
+        rows.append([*cells, *(text(line[kind]) for kind in KINDS)])
+    by_k = [["photos, steps", "objects", *(f"yes to {kind}" for kind in KINDS)]]
+    whole = curve(answers)
+    for (k, step), part in whole.groupby(["k", "step"]):
+        of_kind = part.set_index("kind")
+        cells = [f"{k}, {step}", str(int(part.objects.max()))]
+        for kind in KINDS:
+            line = of_kind.loc[kind]
+            cells.append(_text(line.yes, line.low, line.high, int(line.n)))
+        by_k.append(cells)
+    parts = [text_table(rows), text_table(by_k)]
+    if "choices" in tables:
+        parts.append(text_table(_choice_rows(tables["choices"])))
+    return "\n\n".join([*parts, NOTE])
+
+
+def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
+    """By suite: whether the model chooses the target among the objects of listed episodes."""
+    from vap_core.study.stats import share_by
+
+    rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
+    usual = reading(table, "as learned")
+    usual = usual[usual.k == USUAL_K]
+    several = usual["epochs"].nunique() > 1
+    for (suite, epochs, seen_in), part in usual.groupby(["suite", "epochs", "seen_in"], sort=False):
+        found = chosen(part)
+        name = f"{suite}, {epochs} epochs" if several else str(suite)
+        chance = f"{100 * found.chance.mean():.1f}"
+        rows.append([name, str(seen_in), chance, share_by(found, "right", OBJECTS).text()])
+    return rows
+
+
+def text(found: Rate) -> str:
+    """A rate with its interval and n: "97.2 [94.0, 98.7] 180"."""
+    return _text(found.value, found.low, found.high, found.n)
+
+
+def _numbers(found: Rate) -> tuple[int, float, float, float]:
+    return found.n, found.value, found.low, found.high
+
+
+def _text(value: float, low: float, high: float, n: int) -> str:
+    return Estimate(value=float(value), low=float(low), high=float(high), n=n).text()

@@ -1,0 +1,584 @@
+"""A study of episodes, and what its batches need: memory, a scene, models and a policy."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from vap_core import __version__
+from vap_core.base.commands import command
+from vap_core.base.errors import BadStudy, one_of
+from vap_core.base.extras import require
+from vap_core.base.types import Rgb, value
+from vap_core.memory import load_bank, register, save
+from vap_core.perception.describe import AttributeCaptioner, with_description
+from vap_core.perception.protocols import Detector, Stack
+from vap_core.perception.stacks import check_stack, checksums, load_stack
+from vap_core.policies.lerobot import checkpoints
+from vap_core.policies.mini_pi0 import token_file
+from vap_core.policies.mini_pi0.learned_token import WORD
+from vap_core.policies.mini_pi0.teach_token import file_suffix, model_of, teach, teach_own
+from vap_core.policies.names import MINI as MINI
+from vap_core.policies.names import POLICIES as POLICIES
+from vap_core.policies.names import PRIVILEGED as PRIVILEGED
+from vap_core.policies.names import SHIPPED as SHIPPED
+from vap_core.policies.names import check_policy_name, checkpoint_of, label_of, shipped_checkpoint
+from vap_core.policies.protocol import Policy, PrivilegedPolicy
+from vap_core.policies.scripted.expert import Expert
+from vap_core.policies.scripted.random import Random
+from vap_core.policies.scripted.scripted import Scripted
+from vap_core.rollout.loop import Follow, Trial, rollout
+from vap_core.rollout.policy_call import check_policy
+from vap_core.rollout.prompters.text import generic
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import ObjectModel, get_object
+from vap_core.simulation.env import Env
+from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.scenes import Meshes, Scene
+from vap_core.simulation.studio import reference_views
+from vap_core.simulation.suites import Suite, benchmark_name, starts
+from vap_core.simulation.suites.open_row import build_scene, models_of
+from vap_core.simulation.types import EpisodeRow
+from vap_core.study import world
+from vap_core.study.methods import (
+    FEWEST_REFERENCES,
+    METHODS,
+    PUBLISHED,
+    describe,
+    find,
+    has_no_command,
+    hidden_calls,
+    known_methods,
+    make_prompter,
+    needs_description,
+    needs_memory,
+    needs_stack,
+    needs_token,
+    references_needed,
+    suits_shared,
+    token_space,
+)
+
+
+def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
+    """The scripted policy, calibrated to the suite's first camera.
+
+    Raises: UnknownName for a camera that the scene lacks, or a robot without a scripted motion.
+    """
+    (camera,) = Env(scene, cameras=suite.cameras[:1]).cameras()
+    return Scripted(
+        detector=detector,
+        camera=camera,
+        robot=scene.robot,
+        hz=suite.hz,
+        control=suite.control,
+    )
+
+
+def make_policy(
+    name: str, scene: Scene, suite: Suite, stack: Stack | None
+) -> Policy[Any] | PrivilegedPolicy[Any]:
+    """One of `POLICIES`; only the scripted one needs a stack. Raises: UnknownName."""
+    match name:
+        case "scripted":
+            assert stack is not None, "the scripted policy needs a detector"
+            return scripted(stack.category_detector, scene, suite)
+        case "expert":
+            return Expert()
+        case "random":
+            return Random()
+    raise one_of("make_policy: policy", name, POLICIES)
+
+
+def shipped(suite: str) -> Path:
+    """Where the shipped policy of a suite is, if there is one."""
+    return shipped_checkpoint(benchmark_name(suite))
+
+
+def policy_today(policy: str, label: str, suite: str) -> str:
+    """How the policy of a run is named here, of which a row of the suite has this label.
+
+    Where the run names no folder that is here, it is the shipped one that the label names: the
+    suite's default, or a folder below data/policies.
+    """
+    from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
+
+    name = checkpoint_of(label)
+    if not name or not (SHIPPED / name).is_dir() or is_checkpoint_name(policy):
+        return policy
+    return MINI if name == shipped(suite).name else f"data/policies/{name}"
+
+
+def default_policy(suites: Iterable[str]) -> str:
+    """The shipped frozen policy where every suite has one, else the scripted one."""
+    return MINI if all(shipped(suite).is_dir() for suite in suites) else "scripted"
+
+
+MESHES = ("plain", "menagerie")
+HOTTEST = 10.0
+"""The largest factor of a policy's sampling noise."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """The same episodes of every task, once per method and seed.
+
+    `episodes` None takes whole lists. `images_every`, `follow` and `audit` are rollout.Trial's.
+    `temperature` scales the sampling noise of a mini-pi0; None leaves it as its checkpoint says.
+    `object` names an object that takes the target's place (suites.own_object). `suite_files` are
+    the files of own suites; they are executed (suites.own). `split` takes the episodes of one split
+    of a suite's list, for example visual matching.
+
+    Raises: UnknownName, BadStudy, when it is built from what does not fit together; BadSuite for a
+        file or a list of a suite that is damaged; MissingPart.
+    """
+
+    tasks: tuple[tuple[str, str], ...]
+    methods: tuple[str, ...]
+    episodes: int | None = None
+    seed: int = 0
+    seeds: int = 1
+    policy: str = "scripted"
+    stack: str = "embedded"
+    robots: Meshes = "plain"
+    images_every: int = 0
+    follow: Follow = "step"
+    audit: bool = False
+    temperature: float | None = None
+    object: str = ""
+    suite_files: tuple[str, ...] = ()
+    split: str = ""
+
+    def __post_init__(self) -> None:
+        self.open_suites()
+        _check_names(self)
+        _check_policy(self)
+
+    def rows(self, suite: str, task: str) -> tuple[EpisodeRow, ...]:
+        return suites.listed(
+            suite,
+            task,
+            n=self.episodes,
+            seed=self.seed,
+            seeds=self.seeds,
+            own_target=self.object,
+            split=self.split,
+        )
+
+    def open_suites(self) -> None:
+        """Make its own suites known in this process. Raises: BadSuite."""
+        for file in self.suite_files:
+            suites.open_file(Path(file))
+
+    def checkpoint(self, suite: str) -> str:
+        """The folder or hub id of the policy's weights for a suite; "" where it has none."""
+        if self.policy == MINI:
+            return str(shipped(suite))
+        return "" if self.policy in POLICIES else self.policy
+
+    def policy_label(self, suite: str) -> str:
+        """What the rows of a suite call the policy. Raises: BadPolicy."""
+        checkpoint = self.checkpoint(suite)
+        return label_of(checkpoint, self.temperature) if checkpoint else self.policy
+
+    def any_method(self, holds: Callable[[str], bool]) -> bool:
+        """Whether something holds for any of its methods."""
+        return any(holds(method) for method in self.methods)
+
+    def uses_stack(self) -> bool:
+        """Whether anything of it loads the stack."""
+        return self.policy == "scripted" or self.any_method(needs_memory)
+
+    def next_command(self, *words: str | Path) -> str:
+        """A command to print, to be run next; it finds the study's own suites."""
+        return command(*words, environment=suites.own.environment(self.suite_files))
+
+    def configuration(self) -> dict[str, Any]:
+        """What the results depend on, as JSON.
+
+        Weights, episode lists, and the world (robots, objects, styles, sensors) enter by checksum,
+        methods by name, and those that are not published by what they change, too. With the
+        scripted policy the motions that do not ship enter as well; of a stack whose parts are not
+        all embedded, its models' files and the thresholds kept on this machine; of a caller's own
+        stack what its parts are.
+
+        Raises: BadPolicy for a checkpoint that is not on this machine; MissingWeights when the
+            backbone's package is not installed or the stack's models are not here; BadSuite for a
+            list without a checksum; BadObject for a damaged scan; BadStudy for an arm that
+            `describe` refuses.
+        """
+        digests = {}
+        for suite, _ in self.tasks:
+            if suites.has_list(suite):
+                digests[suite] = suites.digest(suite)
+        checkpoints_used = set()
+        for suite, _ in self.tasks:
+            checkpoints_used.add(self.checkpoint(suite))
+        names = sorted(checkpoints_used - {""})
+        fingerprints = [checkpoints.fingerprint(name) for name in names]
+        about = asdict(self)
+        if self.temperature is None:  # digests are those of versions without it
+            del about["temperature"]
+        for option in ("object", "split"):
+            if not about[option]:
+                del about[option]
+        del about["suite_files"]  # the lists' digests stand for them
+        if names == [self.policy]:
+            about["checkpoint"] = fingerprints[0]
+        elif names:
+            about["checkpoints"] = fingerprints
+        own = sorted(set(self.methods) - PUBLISHED)
+        if own:
+            about["arms"] = {method: describe(find(method)) for method in own}
+        about |= {"version": __version__, "lists": digests}
+        about |= checksums(self.stack if self.uses_stack() else "embedded")
+        if digests and self.seed + self.seeds > 1:
+            about["starts"] = starts.settings()
+        own_motions = {}
+        if self.policy == "scripted":
+            own_motions = world.own_motions(suite for suite, _ in self.tasks)
+        if own_motions:
+            about["motions"] = own_motions
+        listed = [(suite, self.rows(suite, task)) for suite, task in self.tasks]
+        return {**about, "world": world.digest(listed)}
+
+
+def _check_names(study: Study) -> None:
+    for method in study.methods:
+        if method not in known_methods():
+            raise one_of("Study: method (or an arm of `ablate`)", method, METHODS)
+    check_policy_name(study.policy)
+    if study.robots not in MESHES:
+        raise one_of("Study: robots", study.robots, MESHES)
+    check_stack(study.stack, "Study")
+    for suite, task in study.tasks:
+        if not study.rows(suite, task):
+            raise _no_such_split(study.split, suite, task)
+        for method in study.methods:
+            if suite in suites.SHARED and not suits_shared(method):
+                raise BadStudy(
+                    f"Study: {method} knows one object, and {suite} has several; take generic, or "
+                    "vap and its variants."
+                )
+
+
+def _no_such_split(split: str, suite: str, task: str) -> BadStudy:
+    there = sorted({row.split for row in suites.rows(suite, task)} - {""})
+    known = f"it has {' and '.join(there)}" if there else "its list has no splits"
+    return BadStudy(f"Study: {suite}/{task} has no split {split!r}; {known}.")
+
+
+def _check_policy(study: Study) -> None:
+    policy = study.policy
+    if policy not in POLICIES:
+        require("policy", f"the policy {policy}")
+    for suite, _ in study.tasks:
+        if policy == MINI and not shipped(suite).is_dir():
+            names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
+            there = ", ".join(names) or "none"
+            raise BadStudy(
+                f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
+                f"train policy --suite {suites.benchmark_name(suite)}"
+            )
+    if study.temperature is not None:
+        if policy in POLICIES:
+            raise BadStudy(
+                f"Study: policy {policy!r} samples nothing; leave --temperature out, or take "
+                f"--policy {MINI}."
+            )
+        if not 0 <= study.temperature <= HOTTEST:
+            raise BadStudy(
+                f"Study: temperature {study.temperature:g}; say a number from 0, no noise, to "
+                f"{HOTTEST:g}."
+            )
+    if policy in PRIVILEGED and study.audit:
+        raise BadStudy(
+            f"Study: policy {policy!r} consumes no prompt; there is nothing to audit. Leave "
+            "--audit out."
+        )
+    if policy in PRIVILEGED and study.methods != ("generic",):
+        raise BadStudy(
+            f"Study: policy {policy!r} reads the simulator, not pictures; no method can prompt "
+            "it. Use --method generic."
+        )
+    absent = [suite for suite, _ in study.tasks if suite.endswith(suites.ABSENT)]
+    if policy == "expert" and absent:
+        raise BadStudy(
+            f"Study: {absent[0]} leaves the target out, which the expert would go for; leave that "
+            "suite or the expert out."
+        )
+    if policy == "scripted" and study.any_method(has_no_command):
+        raise BadStudy(
+            f"Study: policy {policy!r} parses its command, and blank-text gives it none; leave "
+            f"blank-text out, or take --policy {MINI}."
+        )
+    if policy in POLICIES and study.any_method(needs_token):
+        raise BadStudy(
+            f"Study: policy {policy!r} has no words that could be learned; leave soft out, or take "
+            f"--policy {MINI}."
+        )
+
+
+DEMO = Study(
+    tasks=(("widowx-pick", "pick-straw-cup"), ("franka-pick", "pick-cup")),
+    methods=("generic", "vap"),
+    episodes=20,
+)
+"""The main job: one task on each of two robots, generic against VAP."""
+
+
+HIDDEN_FROM = 2
+"""The call of the policy, counted from 0, from which an arm of `ablate` hides the target."""
+_stack = cache(load_stack)
+_last_scene: dict[tuple[str, tuple[str, ...], str, Meshes], Scene] = {}
+"""The scene that was built last, by suite, objects, variant and meshes."""
+
+
+def register_personal(study: Study, bank: Path) -> None:
+    """Remember the personal object of every task from five rendered reference views, or more where
+    a method wants them.
+
+    An object that is in memory with enough of them stays. Where a method needs its description, it
+    is described too, offline; for the soft prompt its token is learned. A study that prompts
+    nothing needs no memory.
+
+    Raises: as `load_stack`; BadMemory for a damaged memory; BadObject for a damaged scan;
+        BadPolicy, BadStudy, as `teach` and `teach_own`; BadOutput when `bank` cannot be written.
+    """
+    if not study.any_method(needs_memory):
+        return
+    stack = load_stack(study.stack)
+    known = load_bank(bank)
+    n_references = max(map(references_needed, study.methods))
+    for suite, task, target in _remembered(study):
+        rows = study.rows(suite, task)
+        obj = known.get(target)
+        if obj is None or len(obj.crops) < n_references:
+            model = get_object(target)
+            photos = _photos(model, n_references)
+            obj, _ = register(target, model.category, photos, stack.detector, stack.encoder)
+        if study.any_method(needs_description) and obj.description is None:
+            seen = obj.first(FEWEST_REFERENCES)
+            described = with_description(seen, AttributeCaptioner(stack.segmenter))
+            obj = replace(obj, description=described.description)
+        spaces = {token_space(method) for method in study.methods}
+        if spaces & {"copied", "aligned"}:
+            initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
+            teach(rows, bank, initialised_from)
+        if "own" in spaces:
+            teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
+        if obj is not known.get(target):
+            save(bank, obj, replace=True)
+            known[target] = obj
+
+
+def _photos(model: ObjectModel, n: int) -> list[Rgb]:
+    """The reference photos of which each method takes as many as it wants, the first of them.
+
+    The first five do not depend on `n`: methods differ in nothing else, whatever else is run.
+    """
+    photos = reference_views(model, FEWEST_REFERENCES)
+    if n > FEWEST_REFERENCES:
+        photos += reference_views(model, n - FEWEST_REFERENCES, seed=1)
+    return photos
+
+
+def _remembered(study: Study) -> list[tuple[str, str, str]]:
+    """Suite, task and object of all that a study remembers; in shared scenes what is owned."""
+    found = []
+    for suite, task in study.tasks:
+        row = study.rows(suite, task)[0]
+        models = [owned.model for owned in row.owned] or [row.target]
+        found += [(suite, task, model) for model in models]
+    return found
+
+
+def make_trial(
+    study: Study,
+    rows: Sequence[EpisodeRow],
+    method: str,
+    bank: Path,
+    policy: Policy[Any] | PrivilegedPolicy[Any] | None = None,
+) -> Trial:
+    """The scene, models and policy of some rows of one task and variant, built or cached.
+
+    The scene holds only what the rows place. It is closed when the next one is built. `policy`
+    takes the place of the study's; an arm of `ablate` then hides the target for that one's calls.
+
+    Raises: UnknownName for a suite that no registry holds; BadPolicy when the checkpoint is not on
+        this machine or does not fit the suite, or `policy` lacks what the loop needs; BadMemory
+        when a description or a token that the method needs is not in `bank`; MissingMeshes for a
+        robot whose meshes are not here.
+    """
+    first = rows[0]
+    suite = suites.suite(first.suite)
+    scene = _scene(study, rows)
+    scripted = policy is None and study.policy == "scripted"
+    stack = _stack(study.stack) if needs_stack(method) or scripted else None
+    if policy is None:
+        policy = _policy(study=study, method=method, row=first, bank=bank, scene=scene, stack=stack)
+    check_policy(policy)
+    return Trial(
+        method=method,
+        scene=scene,
+        policy=policy,
+        prompter=make_prompter(method, first, bank=bank, scene=scene, stack=stack),
+        control=suite.control,
+        sensor=suite.sensor,
+        occlusion=_occlusion(method, policy.execute),
+        images_every=study.images_every,
+        follow=study.follow,
+        audit=study.audit,
+    )
+
+
+def _occlusion(method: str, execute: int) -> Occlusion | None:
+    """When the method's target is hidden: from the policy's HIDDEN_FROM-th call on."""
+    calls = hidden_calls(method)
+    if not calls:
+        return None
+    return Occlusion(start=HIDDEN_FROM * execute, frames=calls * execute)
+
+
+def _policy(
+    study: Study, method: str, row: EpisodeRow, bank: Path, scene: Scene, stack: Stack | None
+) -> Policy[Any] | PrivilegedPolicy[Any]:
+    """The frozen policy of the study; for the soft prompt with the learned token's embedding."""
+    suite = suites.suite(row.suite)
+    if study.policy in POLICIES:
+        return make_policy(study.policy, scene, suite, stack)
+    from vap_core.policies.lerobot import adapter  # and torch
+
+    policy = adapter.load_for_suite(
+        study.checkpoint(row.suite), scene, suite, temperature=study.temperature
+    )
+    if not needs_token(method):
+        return policy
+    embedding = _token_embedding(study, method, row, bank)
+    return policy.with_tokens({WORD: embedding})
+
+
+def _token_embedding(
+    study: Study, method: str, row: EpisodeRow, bank: Path
+) -> Float32[np.ndarray, " d"]:
+    """The embedding that the target's word has under a method with a soft prompt."""
+    from vap_core.policies.mini_pi0.token_alignment import align
+    from vap_core.policies.mini_pi0.vlm import load_from_policy
+
+    folder = checkpoints.locate(study.checkpoint(row.suite))
+    rows = study.rows(row.suite, row.task)
+    space = token_space(method)
+    if space == "own":
+        own = load_from_policy(folder).sha256()
+        suffix = file_suffix(rows, own, token_file.OWN_SUFFIX)
+        return token_file.load(bank, row.target, own, suffix).embedding
+    initialised_from = checkpoints.config_field(folder, "vlm")
+    token = token_file.load(bank, row.target, initialised_from, file_suffix(rows, initialised_from))
+    if space == "aligned":
+        return align(token.embedding, model_of(initialised_from), folder)
+    return token.embedding
+
+
+def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
+    """The scene of what some rows of one task and variant place; the last one is kept.
+
+    Objects are in the order of the variant's whole list, so that the physics of an episode does not
+    depend on the rows beside it. Physics among 100 parked objects takes 2.6 times as long as among
+    6.
+    """
+    first = rows[0]
+    listed = []
+    for row in study.rows(first.suite, first.task):
+        if row.variant == first.variant:
+            listed.append(row)
+    placed = models_of(rows)
+    names = [name for name in models_of([*listed, *rows]) if name in placed]
+    key = (first.suite, tuple(names), first.variant, study.robots)
+    if key not in _last_scene:
+        for scene in _last_scene.values():
+            scene.close()
+        _last_scene.clear()
+        _last_scene[key] = build_scene(*key)
+    return _last_scene[key]
+
+
+@value
+class Tried:
+    """How often the expert succeeds in a task, and the episodes in which it does not."""
+
+    where: str
+    n: int
+    failed: tuple[str, ...]
+
+    def __str__(self) -> str:
+        succeeded = self.n - len(self.failed)
+        text = f"{self.where}: the expert succeeds in {succeeded} of {self.n} episodes"
+        if self.failed:
+            text += f"; not in {', '.join(self.failed)}"
+        return text
+
+
+def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
+    """Whether the expert succeeds in each row; rows of one suite. About a second a row.
+
+    Raises: UnknownName for a suite or an object that no registry holds.
+    """
+    succeeded: dict[int, bool] = {}
+    for variant in dict.fromkeys(row.variant for row in rows):
+        numbers = [i for i, row in enumerate(rows) if row.variant == variant]
+        part = [rows[i] for i in numbers]
+        for i, good in zip(numbers, _try_rows(part), strict=True):
+            succeeded[i] = good
+    return tuple(succeeded[i] for i in range(len(rows)))
+
+
+def _try_rows(rows: Sequence[EpisodeRow]) -> list[bool]:
+    """`feasible` for rows of one suite and variant."""
+    suite = suites.suite(rows[0].suite)
+    with build_scene(suite.name, models_of(rows), rows[0].variant) as scene:
+        trial = Trial(
+            method="generic",
+            scene=scene,
+            policy=Expert(),
+            prompter=generic(),
+            control=suite.control,
+            sensor=suite.sensor,
+            follow="call",
+        )
+        return [episode.outcome.success for episode in rollout(trial, rows)]
+
+
+def check_feasible(study: Study) -> tuple[Tried, ...]:
+    """The expert's successes in every task of a study.
+
+    Raises: BadStudy where it succeeds in no episode of a task: then no policy can be blamed.
+    """
+    found = []
+    for suite, task in study.tasks:
+        rows = study.rows(suite, task)
+        failed = []
+        for row, good in zip(rows, feasible(rows), strict=True):
+            if not good:
+                failed.append(_name(row))
+        tried = Tried(where=f"{suite}/{task}", n=len(rows), failed=tuple(failed))
+        if len(failed) == len(rows):
+            raise BadStudy(f"{tried}. {_remedy(study)}")
+        found.append(tried)
+    return tuple(found)
+
+
+def _name(row: EpisodeRow) -> str:
+    return f"{row.episode} (seed {row.seed})" if row.seed else str(row.episode)
+
+
+def _remedy(study: Study) -> str:
+    if study.object:
+        return (
+            f"{study.object} may be too wide or too low for the robot: import it with another "
+            "--height-cm, or take a task that asks for a touch."
+        )
+    return "Leave the task out, or move its objects within the robot's reach."
