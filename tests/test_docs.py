@@ -159,7 +159,7 @@ def test_imports_of_the_code_are_there(page: str) -> None:
 def test_the_ablation_of_five_lines_is_one() -> None:
     (block,) = (block for block in blocks("docs/extend.md", "python") if "Ablation(" in block)
     assert len(block.splitlines()) == 5
-    ((name, ablation),) = eval(f"{{{block}}}", vars(arms)).items()
+    ((name, ablation),) = eval(f"{{{block}}}", vars(methods)).items()
     assert isinstance(ablation, methods.Ablation)
     assert name not in methods.ABLATIONS
     assert not set(ablation.arms) & set(known_methods())

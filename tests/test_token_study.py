@@ -48,7 +48,7 @@ def tiny(
         rng = np.random.default_rng([seed, n, *model.name.encode()])
         return list(rng.integers(0, 256, (n, 32, 32, 3)).astype(np.uint8))
 
-    for module in (study, teach_token):
+    for module in (tokens, teach_token):
         monkeypatch.setattr(module, "reference_views", views)
 
     def training(epochs: int = 2) -> TokenTraining:

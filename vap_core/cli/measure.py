@@ -482,7 +482,7 @@ def attention(
     Example: python -m vap_core measure attention data/results/first_policy.parquet
         --record simpler-bridge/put-camera/soft/22
     """
-    from vap_core.analysis.attention import examples, replay
+    from vap_core.analysis.attention import examples, replay, report
     from vap_core.analysis.attention.tables import publish as publish_tables
     from vap_core.base.commands import command
 
@@ -504,4 +504,4 @@ def attention(
     found = replay.run_replay(run, out, wanted, workers=workers)
     if publish is not None:
         publish_tables(out, publish)
-    print(parsers.text(found))
+    print(report.text(found))
