@@ -183,7 +183,7 @@ def test_a_folder_that_is_no_finished_survey_is_refused(tmp_path: Path) -> None:
 @pytest.mark.sweep
 def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--jobs", "1"]
+    small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--workers", "1"]
     words = [
         "measure",
         "perception",
