@@ -18,17 +18,6 @@ from vap_core.recording.colours import image_root
 PROPERTIES = "/__properties"
 """Rerun's reserved entity; below it is one entity per property group."""
 
-KINDS: dict[str, type | tuple[type, ...]] = {
-    **dict.fromkeys(
-        ("suite", "task", "method", "policy", "git", "instruction", "rewritten", "outcome"), str
-    ),
-    **dict.fromkeys(("detail", "case", "sub_case", "deciding_camera", "case_sentence"), str),
-    **dict.fromkeys(("episode", "seed", "steps", "held_steps", "deciding_frame"), int),
-    **dict.fromkeys(("hz", "case_confidence"), (int, float)),
-    **dict.fromkeys(("success", "success_once", "cmr"), bool),
-    **dict.fromkeys(("wrong_object", "first_object_correct"), bool),
-}
-"""What properties of a recording must be where they are there."""
 MOST_HZ = 1000
 """Control steps a second. A film repeats its last picture for seconds, which has to end."""
 UNREADABLE = (RuntimeError, ValueError, OSError, Warning)
@@ -59,7 +48,7 @@ def open_whole(path: Path) -> RrdReader:
 
 
 def recording_id(path: Path) -> str:
-    """The id of a recording; its index and its correction have the same."""
+    """The id of a recording."""
     return str(RrdReader(path).recordings()[0].recording_id)
 
 
@@ -70,15 +59,10 @@ def property_group(chunk: Chunk) -> str | None:
 
 
 def read_properties(chunk: Chunk) -> dict[str, Any]:
-    """The properties in a chunk of one property group."""
+    """The properties in a chunk of one property group, without those that hold nothing."""
     batch = chunk.to_record_batch()
-    values = {}
-    for name in batch.schema.names:
-        if name.startswith("rerun."):
-            continue
-        cells = batch[name][0].as_py()
-        values[name] = cells[0] if cells else None
-    return values
+    cells = {n: batch[n][0].as_py() for n in batch.schema.names if not n.startswith("rerun.")}
+    return {name: cell[0] for name, cell in cells.items() if cell and cell[0] is not None}
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -106,7 +90,7 @@ def read_summary(path: Path) -> dict[str, Any]:
             warnings.simplefilter("error")
             for chunk in read_chunks(path):
                 if property_group(chunk) in ("rollout", "outcome"):
-                    summary |= read_checked_properties(chunk)
+                    summary |= read_properties(chunk)
                     continue
                 batch = chunk.to_record_batch()
                 if "frame_index" in batch.schema.names:
@@ -116,30 +100,6 @@ def read_summary(path: Path) -> dict[str, Any]:
     except UNREADABLE as err:
         raise unreadable(path, err) from err
     return {**summary, "frames": len(steps)}
-
-
-def read_checked_properties(chunk: Chunk) -> dict[str, Any]:
-    """`read_properties` without those that hold nothing where something is expected.
-
-    Raises: ValueError, for a property of another kind than a recorder writes.
-    """
-    checked = {}
-    found: dict[str, Any] = read_properties(chunk)
-    for name, value in found.items():
-        kind = KINDS.get(name)
-        if kind is not None:
-            if value is None:
-                continue
-            of_kind = isinstance(value, kind) and (type(value) is bool) == (kind is bool)
-            if not of_kind:
-                raise ValueError(f"its property {name} is {str(value)[:40]!r}")
-            number: Any = value
-            if kind is int and not -(2**63) <= number < 2**63:
-                raise ValueError(f"its property {name} is {value}")
-            if name == "hz" and not 0 <= number <= MOST_HZ:
-                raise ValueError(f"its property hz is {value}")
-        checked[name] = value
-    return checked
 
 
 def unreadable(path: Path, reason: object) -> BadRecording:
