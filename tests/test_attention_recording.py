@@ -24,7 +24,7 @@ from vap_core.recording.read import read_pictures
 from vap_core.recording.show import attended
 from vap_core.simulation import suites
 
-RUN = DATA / "results" / "first_policy.parquet"
+RUN = DATA / "results" / "mini_pi0.parquet"
 """simpler-bridge's first policy, whose token is kept."""
 NAME = "simpler-bridge/pick-shaver/soft/12"
 IMAGE = "/observation.images.front"
@@ -40,7 +40,7 @@ def put_token(memory: Path) -> None:
     kept = table[(table["learned_in"] == "vlm") & (table["k"] == teach_token.K)]
     (row,) = kept[kept["object"] == "shaver-personal"].to_dict("records")
     embedding = np.array(row["embedding"], np.float32)
-    model = load_vlm(SHIPPED / "mini-paligemma").sha256()
+    model = load_vlm(SHIPPED / "mini-paligemma-tint-free").sha256()
     suffix = teach_token.file_suffix(suites.rows("simpler-bridge", "pick-shaver"), model)
     token_file.save(memory, token_file.Token("shaver-personal", embedding, 1.0, model), suffix)
 

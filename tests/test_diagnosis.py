@@ -374,20 +374,6 @@ def test_a_recording_of_older_weights_is_made_anew(
     assert recording_of(failures, 0).stat().st_mtime_ns == made
 
 
-def test_a_run_of_an_earlier_default_policy_is_run_again_with_that_one() -> None:
-    """Some of its manifests name the folder, others the default of the suite."""
-    named = set()
-    for manifest, episodes in read_published(DATA / "results" / "first_policy.parquet"):
-        row = episodes.iloc[0].to_dict()
-        named.add(manifest["configuration"]["policy"])
-        assert study_of(manifest, row).policy_label(row["suite"]) == row["policy"]
-        for label in ("mini_pi0:0000000000", "mini_pi0:mini-pi0-of-nobody@00000000", "scripted"):
-            study = study_of(manifest, {**row, "policy": label})
-            assert study.policy == manifest["configuration"]["policy"]
-    first = {f"data/policies/mini-pi0-{suite}" for suite in ("simpler-bridge", "vlabench")}
-    assert named == {"mini-pi0", *first}
-
-
 def test_a_run_of_a_policy_that_has_moved_is_run_again_with_the_shipped_one() -> None:
     """Manifests name the folder of their day; the label's digest is checked before it is run."""
     moved = 0

@@ -465,10 +465,10 @@ def test_a_shipped_policy_is_found_from_every_folder(
 ) -> None:
     """Published tables name it from the repository, and notebooks run in a folder of their own."""
     monkeypatch.chdir(tmp_path)
-    name = "data/policies/mini-pi0-simpler-bridge"
+    name = "data/policies/mini-pi0-simpler-bridge-wide-seed-0"
     assert is_checkpoint_name(name)
-    assert local_folder(name) == SHIPPED / "mini-pi0-simpler-bridge"
-    assert fingerprint(name) == fingerprint(SHIPPED / "mini-pi0-simpler-bridge")
+    assert local_folder(name) == SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0"
+    assert fingerprint(name) == fingerprint(SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0")
     assert local_folder("data/policies/no-such") is None
     assert not is_checkpoint_name("data/policies/no-such")
     own = tmp_path / name

@@ -47,7 +47,7 @@ from vap_make.vlm import train as vlm
 
 def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
     grown = copytree(SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0", tmp_path / "mini-pi0")
-    root = copytree(SHIPPED / "mini-paligemma", tmp_path / "mini-paligemma")
+    root = copytree(SHIPPED / "mini-paligemma-tint-free", tmp_path / "mini-paligemma-tint-free")
     weights = [grown / "model.safetensors", root / "vlm.safetensors"]
     before = [sha256_of(path) for path in weights]
     with pytest.raises(BadOutput, match=r"holds a model without training\.pt.*another --out"):
@@ -59,7 +59,7 @@ def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
 
 def test_the_model_that_ships_is_taken_as_it_is(tmp_path: Path) -> None:
     """It is what `train policy` looks for beside its `--out`; its card is of an older code."""
-    root = copytree(SHIPPED / "mini-paligemma", tmp_path / "mini-paligemma")
+    root = copytree(SHIPPED / "mini-paligemma-tint-free", tmp_path / "mini-paligemma-tint-free")
     before = {path.name: path.read_bytes() for path in root.iterdir()}
     assert vlm.make(root, cache=tmp_path / "cache") == root
     assert {path.name: path.read_bytes() for path in root.iterdir()} == before
@@ -182,7 +182,7 @@ def test_a_disk_that_is_full_while_weights_are_written_is_one_line(tmp_path: Pat
         save({"step": 2, "model": torch.zeros(100_000)})
     assert checkpoint(tmp_path / "training.pt", resume=True)[0] == {"step": 1}
 
-    config: Any = load_policy(SHIPPED / "mini-pi0-simpler-bridge").policy.config
+    config: Any = load_policy(SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0").policy.config
     learner, held = Learner(config), object.__new__(Frames)
     out = tmp_path / "out"
     out.mkdir()

@@ -94,7 +94,9 @@ def compare(
         found = _unit_rows(ours[rows]) @ every.T
         found[np.arange(len(rows)), asked[rows]] = -np.inf
         nearest += int((found.max(axis=1, initial=-np.inf) <= cosines[rows] + 1e-12).sum())
-    x, y = (part - part.mean(axis=0) for part in (np.float64(ours), np.float64(theirs)))
+    x, y = (
+        part - part.mean(axis=0) for part in (ours.astype(np.float64), theirs.astype(np.float64))
+    )
     cross, of_one, of_other = (np.square(a.T @ b).sum() for a, b in ((x, y), (x, x), (y, y)))
     scale = np.sqrt(of_one * of_other)
     return Comparison(
@@ -113,14 +115,14 @@ def paired_cosines(
     ours: Float32[np.ndarray, "r d"], theirs: Float32[np.ndarray, "r d"]
 ) -> Float64[np.ndarray, " r"]:
     """The cosine of every pair of rows in float64; nan where one is zero."""
-    a, b = np.float64(ours), np.float64(theirs)
+    a, b = ours.astype(np.float64), theirs.astype(np.float64)
     norms = np.sqrt(np.square(a).sum(1) * np.square(b).sum(1))
     return np.divide((a * b).sum(1), norms, out=np.full(len(a), np.nan), where=norms > 0)
 
 
 def _unit_rows(rows: Float32[np.ndarray, "r d"]) -> Float64[np.ndarray, "r d"]:
-    norms = np.linalg.norm(np.float64(rows), axis=1, keepdims=True)
-    return np.float64(rows) / np.where(norms > 0, norms, 1)
+    norms = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
+    return rows.astype(np.float64) / np.where(norms > 0, norms, 1)
 
 
 def _cka_debiased(x: Float64[np.ndarray, "n d"], y: Float64[np.ndarray, "n d"]) -> float:
