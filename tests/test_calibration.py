@@ -13,7 +13,7 @@ from tests.toys import MeanColour, SameColour, segmenter
 from vap_core.analysis import ground
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
-from vap_core.cli import doctor
+from vap_core.cli import machine
 from vap_core.perception import kept_thresholds, stacks
 from vap_core.perception.foundation import store
 from vap_core.perception.protocols import Stack, Thresholds
@@ -291,11 +291,11 @@ def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
 
 def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeypatch):
     monkeypatch.setenv(store.VARIABLE, str(tmp_path))
-    finding = doctor._not_in_view()
+    finding = machine._not_in_view()
     assert not finding.works
     assert not finding.needed
     assert "foundation, foundation-small: no threshold" in finding.detail
     assert "calibrate --stack foundation --keep" in finding.detail
     for kind in ("foundation", "foundation-small"):
         kept_thresholds.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
-    assert doctor._not_in_view().works
+    assert machine._not_in_view().works
