@@ -19,7 +19,8 @@ from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.recording import Recorder, read_summary, recover
 from vap_core.simulation.types import Outcome
-from vap_core.study import engine, failures
+from vap_core.study import engine
+from vap_core.study import failures as failures_of
 from vap_core.study.failures import (
     Failures,
     breakdown,
@@ -280,7 +281,7 @@ def test_a_misspelt_correction_is_said_before_the_episode_is_run_again(
     def never(*args: object) -> None:
         raise AssertionError("run again")
 
-    monkeypatch.setattr(failures, "recording_to_show", never)
+    monkeypatch.setattr(failures_of, "recording_to_show", never)
     with pytest.raises(UnknownName, match="case 33"):
         correct_failure(list_failures(run), 0, "case 33: slip")
 
@@ -548,28 +549,28 @@ def test_the_other_method_is_of_the_same_episode_policy_and_scene(
         return tmp_path / f"{row['method']}.rrd"
 
     combined = []
-    monkeypatch.setattr(failures, "_recording_of_row", recorded)
+    monkeypatch.setattr(failures_of, "_recording_of_row", recorded)
     monkeypatch.setattr("vap_core.recording.combine_recordings", lambda *of: combined.append(of))
     last = len(generic) - 1
-    out = failures.side_by_side_recording(failures, last, "vap")
+    out = failures_of.side_by_side_recording(failures, last, "vap")
     assert opened == [rows[-2], rows[-1]]
     paths = {"generic": tmp_path / "generic.rrd", "vap": tmp_path / "vap.rrd"}
     assert combined == [(paths, out)]
     with pytest.raises(
         BadStudy, match="'soft' did not run this episode here; there is generic, vap[.]$"
     ):
-        failures.side_by_side_recording(failures, last, "soft")
+        failures_of.side_by_side_recording(failures, last, "soft")
 
 
 def test_a_failure_is_not_laid_beside_itself(run: Path, tmp_path: Path) -> None:
     """Before anything is run or written; the message names the methods that there are."""
     failures = list_failures(run)
     with pytest.raises(BadStudy, match="'generic' is that failure's own method; there is no other"):
-        failures.side_by_side_recording(failures, 0, "generic")
+        failures_of.side_by_side_recording(failures, 0, "generic")
     everything = failures.all_episodes
     both = pd.concat([everything, everything.assign(method="vap")], ignore_index=True)
     with pytest.raises(BadStudy, match="own method; there is vap[.]$"):
-        failures.side_by_side_recording(replace(failures, all_episodes=both), 0, "generic")
+        failures_of.side_by_side_recording(replace(failures, all_episodes=both), 0, "generic")
     picture = tmp_path / "same.png"
     words = ("diagnose", run, "--open", 0, "--against", "generic", "--png", picture)
     assert "is that failure's own method" in refused(*words)

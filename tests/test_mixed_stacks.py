@@ -226,7 +226,7 @@ def test_an_option_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.Monkey
     table = weights_table(tmp_path)
     options = {name for models in PARTS.values() for name in models} - {name for kind in KINDS.values() for name in kind}  # fmt: skip
     for name in options:
-        assert f" {name} " in table
+        assert f"={name} " in table
 
 
 def test_the_page_says_of_every_option_what_it_needs() -> None:

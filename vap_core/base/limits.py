@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+LARGEST_SEED = 2**32
+"""Seeds are smaller: a date is one."""
 PAGES = Path("/proc/self/statm")
 """Linux counts this process's pages here, the address space first."""
 AGAIN_S = 1.0

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vap_core.base.commands import command
 from vap_core.cli.command import StackName
 from vap_core.cli.timing import Parts
 
@@ -848,7 +849,7 @@ def bench(
             more = {"earlier": lerobot_from, "ended": ended}
         arms = BENCHES[what](Path(scratch), quick, **more)
         measure(arms, 2 if quick else repeats)
-    about = provenance(command=f"python -m vap_core bench {what}", repeats=len(arms[0].costs))
+    about = provenance(command=command("bench", what), repeats=len(arms[0].costs))
     print(f"{about['machine']}, {about['commit']}\n\n{table(arms)}")
     if what in ("step", "scale", "eval"):
         print(f"\n{table(arms, 'wall')}")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from vap_core.base.limits import LARGEST_SEED
 from vap_core.cli.command import RunFolder, StackName, Workers, names, takes
-from vap_core.study.results import LARGEST_SEED
 
 if TYPE_CHECKING:
     from vap_core.study.engine import Record

@@ -16,6 +16,7 @@ import numpy as np
 from vap_core.base.commands import command
 from vap_core.base.errors import BadOutput, VapError
 from vap_core.base.files import check_regular, parse_json, write_atomic
+from vap_core.base.limits import LARGEST_SEED
 from vap_core.policies.names import PRIVILEGED
 from vap_core.simulation import suites
 from vap_core.study import paper
@@ -51,8 +52,6 @@ EXECUTED = "suite_files"
 """
 LARGEST = 1_000_000
 """Counts are smaller."""
-LARGEST_SEED = 2**32
-"""Seeds are smaller: a date is one."""
 NEEDED_SETTINGS = {"tasks", "methods", "episodes", "seed", "policy"}
 """What the configuration of a run of eval, rollout or demo holds."""
 

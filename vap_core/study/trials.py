@@ -103,12 +103,13 @@ def policy_today(policy: str, label: str, suite: str) -> str:
     """How the policy of a run is named here, of which a row of the suite has this label.
 
     Where the run names no folder that is here, it is the shipped one that the label names: the
-    suite's default, or a folder below data/policies.
+    suite's default, or a folder below data/policies. A default of before keeps the folder that it
+    had, whether it ships or not: today's is another policy.
     """
     from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
 
     name = checkpoint_of(label)
-    if not name or not (SHIPPED / name).is_dir() or is_checkpoint_name(policy):
+    if not name or is_checkpoint_name(policy) or not (policy == MINI or (SHIPPED / name).is_dir()):
         return policy
     return MINI if name == shipped(suite).name else f"data/policies/{name}"
 

@@ -148,7 +148,7 @@ def weights_table(store: Path | None = None) -> str:
                 continue
             problem = find_problem(name, store, quick=True)
             asks = f"; first {source.needs}" if problem and source.needs else ""
-            lines.append(f":{role}={name:<24} {source.repo}: {problem or 'here'}{asks}")
+            lines.append(f"embedded:{role}={name:<24} {source.repo}: {problem or 'here'}{asks}")
     return "\n".join([*lines, *remedies])
 
 
