@@ -155,7 +155,7 @@ def test_kept_thresholds_hold_for_their_encoder(tmp_path):
     assert kept_thresholds.read_thresholds(tmp_path, "foundation", "other") is None
     assert kept_thresholds.read_thresholds(tmp_path, "foundation-small", "dino") is None
     path.write_text(json.dumps({"encoder": "dino"}))
-    with pytest.raises(BadOutput, match="calibrate --stack foundation --keep"):
+    with pytest.raises(BadOutput, match="calibration --stack foundation --keep"):
         kept_thresholds.read_thresholds(tmp_path, "foundation", "dino")
 
 
@@ -187,12 +187,12 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
 )
 def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, monkeypatch):
     """It judges views, so that the scenes alone give too few that are not familiar."""
-    with pytest.raises(BadOutput, match=f"calibrate --stack {name} --photos SET --keep"):
+    with pytest.raises(BadOutput, match=f"calibration --stack {name} --photos SET --keep"):
         run.refuse_keep(name)
     run.refuse_keep(name, [tmp_path])
     judged = replace(TOY, detector=Judge())
     monkeypatch.setattr(stacks, "load_own", lambda name: judged)
-    assert f"calibrate --stack {name} --photos SET --keep" in ground.missing_threshold(name)
+    assert f"calibration --stack {name} --photos SET --keep" in ground.missing_threshold(name)
     monkeypatch.setattr(run, "load_stack", lambda name: judged)
     monkeypatch.setenv(store.VARIABLE, str(tmp_path))
     with pytest.raises(BadOutput, match="more photos in the set"):
@@ -226,7 +226,7 @@ def test_a_kept_threshold_is_a_number(tmp_path, kind, wrong):
 @pytest.mark.parametrize("name", ["embedded", "embedded:encoder=dinov2-small"])
 def test_the_remedy_for_a_damaged_threshold_is_one_that_is_not_refused(name, tmp_path):
     kept_thresholds.thresholds_file(tmp_path, name).write_text("{")
-    with pytest.raises(BadOutput, match=f"run .* calibrate --stack {name} --photos SET --keep"):
+    with pytest.raises(BadOutput, match=f"run .* calibration --stack {name} --photos SET --keep"):
         kept_thresholds.read_thresholds(tmp_path, name, "dino")
 
 
@@ -245,14 +245,14 @@ def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_pat
 def test_an_own_stack_without_thresholds_uses_what_was_kept(tmp_path, monkeypatch):
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
     monkeypatch.setenv(store.VARIABLE, str(tmp_path))
-    assert "calibrate --stack toy --keep" in ground.missing_threshold("toy")
+    assert "calibration --stack toy --keep" in ground.missing_threshold("toy")
     run.refuse_keep("toy")
     run.keep_choice("toy", report.Choice(0.9, None))
     assert stacks.load_own("toy").thresholds == Thresholds(0.9, 0.9)
     assert ground.missing_threshold("toy") == ""
     assert stacks.load_stack("toy").thresholds is None
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, detector=Judge()))
-    with pytest.raises(BadOutput, match="calibrate --stack toy --photos SET --keep"):
+    with pytest.raises(BadOutput, match="calibration --stack toy --photos SET --keep"):
         run.refuse_keep("toy")
 
 
@@ -284,7 +284,7 @@ def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
 
 def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
-    assert "calibrate --stack toy --keep" in ground.missing_threshold("toy")
+    assert "calibration --stack toy --keep" in ground.missing_threshold("toy")
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, thresholds=Thresholds(0.5, 0.5)))
     assert ground.missing_threshold("toy") == ""
 
@@ -295,7 +295,7 @@ def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeyp
     assert not finding.works
     assert not finding.needed
     assert "foundation, foundation-small: no threshold" in finding.detail
-    assert "calibrate --stack foundation --keep" in finding.detail
+    assert "calibration --stack foundation --keep" in finding.detail
     for kind in ("foundation", "foundation-small"):
         kept_thresholds.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
     assert machine._not_in_view().works

@@ -388,7 +388,7 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(
             "mini-pi0-vlabench-wide differs from the recipe in input_features",
         ),
     ],
-    ids=["vlm", "start", "other-vlm", "other-cameras"],
+    ids=["vlm", "start", "other-cameras"],
 )
 def test_what_a_training_grows_from_is_read_before_the_films(
     words: tuple[str | Path, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -71,7 +71,6 @@ def test_it_is_whole_small_and_grown_from_the_model_that_ships(folder: Path) -> 
     [
         "simpler-bridge-wide-seed-0",
         "simpler-fractal-wide",
-        "tabletop-wide",
         "vlabench-wide",
         "shared-pair",
     ],

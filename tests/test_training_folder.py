@@ -57,15 +57,6 @@ def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
     assert [sha256_of(path) for path in weights] == before
 
 
-def test_the_model_that_ships_is_taken_as_it_is(tmp_path: Path) -> None:
-    """It is what `train policy` looks for beside its `--out`; its card is of an older code."""
-    root = copytree(SHIPPED / "mini-paligemma-tint-free", tmp_path / "mini-paligemma-tint-free")
-    before = {path.name: path.read_bytes() for path in root.iterdir()}
-    assert vlm.make(root, cache=tmp_path / "cache") == root
-    assert {path.name: path.read_bytes() for path in root.iterdir()} == before
-    assert not (tmp_path / "cache").exists()
-
-
 def test_another_recipe_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
