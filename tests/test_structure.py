@@ -4,6 +4,7 @@ import ast
 import builtins
 import dis
 import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -133,6 +134,22 @@ def test_a_notebook_imports_the_surface_and_at_most_three_more_modules() -> None
                 if line.startswith("from vap_core"):
                     used.add(line.split()[1])
         assert len(used - {"vap_core"}) <= 3, (path.name, sorted(used))
+
+
+def test_every_module_named_outside_the_package_is_there() -> None:
+    """The set-up, the pages and the build name modules in text that no import checks."""
+    root = ROOT.parent
+    texts = [*(root / ".ci").iterdir(), *root.glob("docs/*.md"), *root.glob("*.md")]
+    texts += [root / name for name in ("Makefile", "pyproject.toml", "setup.py")]
+    known = modules() | {f"vap_make.{name}": path for name, path in modules(MAKE).items()}
+    missing = set()
+    for path in texts:
+        for dotted in re.findall(r"\b(vap_(?:core|make)(?:\.\w+)+)\b", path.read_text()):
+            name = dotted.removeprefix("vap_core.")
+            at = name if name in known else name.rpartition(".")[0]
+            if name != "vap_make.py" and at not in known and at != "vap_make":
+                missing.add(f"{path.name}: {dotted}")
+    assert not missing, sorted(missing)
 
 
 def codes(code: CodeType) -> Iterator[CodeType]:
