@@ -25,7 +25,7 @@ from vap_core.analysis.ablations import (
 )
 from vap_core.attend import Prompting
 from vap_core.base.errors import BadOutput, BadStudy
-from vap_core.base.tables import signed
+from vap_core.base.files import signed
 from vap_core.base.types import Colour, Mask, Rgb
 from vap_core.prompt import PALETTE, PromptForm, Tint, tint
 from vap_core.rollout.types import MaskCoverage

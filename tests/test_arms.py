@@ -16,9 +16,7 @@ from vap_core.base.errors import BadStudy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import tint
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.protocol import PromptContext
-from vap_core.rollout.prompters.switch import SWITCHED, Switch, SwitchPrompter
-from vap_core.rollout.prompters.text import OtherCommand
+from vap_core.rollout.prompters import SWITCHED, OtherCommand, PromptContext, Switch, SwitchPrompter
 from vap_core.rollout.types import Frame
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build

@@ -635,7 +635,7 @@ def test_on_a_rendered_desk_with_three_cameras_no_view_contradicts_another() -> 
     from vap_core.memory import remember
     from vap_core.perception.boxes import crop
     from vap_core.rollout.loop import Trial, rollout
-    from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation.env import Env
     from vap_core.simulation.scenes import build
     from vap_core.simulation.suites import rows, suite

@@ -19,22 +19,22 @@ from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
 from vap_core.analysis.attention import layer_effects
 from vap_core.base.errors import BadPolicy, UnknownName
-from vap_core.policies.hooks import (
+from vap_core.policies.lerobot import hooks, toy_pi0
+from vap_core.policies.lerobot.adapter import LeRobot, load_policy
+from vap_core.policies.lerobot.toy_pi0 import toy_sizes
+from vap_core.policies.protocol import (
     ACTION,
+    PolicyInput,
     attention_observed,
     heat_map,
     layer_shown,
     observe_attention,
     report_attention,
 )
-from vap_core.policies.lerobot import attention_hooks, toy_pi0
-from vap_core.policies.lerobot.adapter import LeRobot, load_policy
-from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder
 from vap_core.recording.entities.pictures import attention_overlay
+from vap_core.rollout.calls import QUERIES, named_queries, only_queries
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.queries import QUERIES, named_queries, only_queries
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import Outcome
 from vap_core.study.trials import Study, make_trial, register_personal, shipped
@@ -254,9 +254,9 @@ def test_pictures_that_are_padded_are_not_read(toys: dict[str, LeRobot]) -> None
     """Of a picture that is padded to a square, some patches show no picture."""
     pi0 = toys["pi0"].policy
     feature = pi0.config.image_features["observation.images.front"]
-    assert attention_hooks.can_watch(pi0)
+    assert hooks.can_watch(pi0)
     with patch.object(feature, "shape", (3, 48, 64)):
-        assert not attention_hooks.can_watch(pi0)
+        assert not hooks.can_watch(pi0)
 
 
 def test_only_the_queries_asked_for_are_kept() -> None:

@@ -15,9 +15,9 @@ from tests.test_why import tabs
 from vap_core.analysis.attention import examples, pictures
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA, SHIPPED
-from vap_core.policies.hooks import heat_map
-from vap_core.policies.mini_pi0 import teach_token, token_file
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.vlm import load_vlm
+from vap_core.policies.protocol import heat_map
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.entities.pictures import attention_overlay
 from vap_core.recording.read import read_pictures
@@ -37,12 +37,14 @@ EXECUTE = 4
 def put_token(memory: Path) -> None:
     """A token of the published tables, so that nothing is learned here."""
     table = pd.read_parquet(DATA / "results" / "token_embeddings.parquet")
-    kept = table[(table["learned_in"] == "vlm") & (table["k"] == teach_token.K)]
+    kept = table[(table["learned_in"] == "vlm") & (table["k"] == learned_token.K)]
     (row,) = kept[kept["object"] == "shaver-personal"].to_dict("records")
     embedding = np.array(row["embedding"], np.float32)
     model = load_vlm(SHIPPED / "mini-paligemma-tint-free").sha256()
-    suffix = teach_token.file_suffix(suites.rows("simpler-bridge", "pick-shaver"), model)
-    token_file.save(memory, token_file.Token("shaver-personal", embedding, 1.0, model), suffix)
+    suffix = learned_token.file_suffix(suites.rows("simpler-bridge", "pick-shaver"), model)
+    learned_token.save(
+        memory, learned_token.Token("shaver-personal", embedding, 1.0, model), suffix
+    )
 
 
 @pytest.fixture(scope="module")

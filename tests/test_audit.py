@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadOutput, BadPolicy, BadStudy
-from vap_core.policies.hooks import TEXT, inputs_observed, observe_inputs, report_input
-from vap_core.policies.protocol import PolicyInput
+from vap_core.policies.protocol import (
+    TEXT,
+    PolicyInput,
+    inputs_observed,
+    observe_inputs,
+    report_input,
+)
 from vap_core.rollout.loop import Follow, Trial, rollout
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.study import logs
 from vap_core.study.trials import DEMO, Study, make_trial, register_personal
 

@@ -9,7 +9,7 @@ from PIL import Image
 from tests.command import refused, vap
 from tests.scanned import EPS
 from vap_core.base.errors import BadPhoto
-from vap_core.base.photos import photos_in
+from vap_core.base.media import photos_in
 
 
 @pytest.fixture(scope="module")

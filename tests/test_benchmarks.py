@@ -13,9 +13,9 @@ import pytest
 
 from vap_core.base.errors import BadAction
 from vap_core.policies.scripted.expert import Expert
-from vap_core.policies.scripted.random import Random
+from vap_core.policies.scripted.scripted import Random
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.simulation import scenes
 from vap_core.simulation.env import Env
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, Suite, Task, rows

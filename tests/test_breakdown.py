@@ -7,10 +7,10 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from vap_core.base import figures
-from vap_core.base.tables import align
+from vap_core.base import pictures
+from vap_core.base.files import align
 from vap_core.recording import recording_file_name
-from vap_core.rollout.failure import CASES
+from vap_core.rollout.types import CASES
 from vap_core.study.charts import funnel_figure
 from vap_core.study.diagnosis import STAGES
 from vap_core.study.failures import (
@@ -157,7 +157,7 @@ def test_a_method_that_reads_the_simulator_is_dashed() -> None:
 def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:
     of_generic = TABLE[TABLE.method == "generic"].dropna(axis="columns", how="all")
     table = of_generic.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
-    page = report_page(table, {}, figures.empty_figure(1.0, 1.0), [], tmp_path)
+    page = report_page(table, {}, pictures.empty_figure(1.0, 1.0), [], tmp_path)
     assert "Where episodes are lost" in page
     assert "Failures (2)" in page
 
@@ -176,7 +176,7 @@ def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
     for each in rows:
         name = recording_file_name("vlabench", "select-cup", each["episode"], 0, "generic")
         (tmp_path / "recordings" / name).write_bytes(b"")
-    forest = figures.empty_figure(1.0, 1.0)
+    forest = pictures.empty_figure(1.0, 1.0)
     page = report_page(pd.DataFrame(rows), {}, forest, [tmp_path], tmp_path)
     assert "Failures (1)" in page
     assert page.count("<article>") == 1

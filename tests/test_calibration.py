@@ -14,7 +14,7 @@ from vap_core.analysis import ground
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.cli import machine
-from vap_core.perception import kept_thresholds, stacks
+from vap_core.perception import protocols, stacks
 from vap_core.perception.foundation import store
 from vap_core.perception.protocols import Stack, Thresholds
 from vap_core.simulation.assets import objects
@@ -150,13 +150,13 @@ def test_answers_of_a_photo_set_count_by_what_is_in_the_photo():
 
 def test_kept_thresholds_hold_for_their_encoder(tmp_path):
     thresholds = Thresholds(0.61, 0.55)
-    path = kept_thresholds.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
-    assert kept_thresholds.read_thresholds(tmp_path, "foundation", "dino") == thresholds
-    assert kept_thresholds.read_thresholds(tmp_path, "foundation", "other") is None
-    assert kept_thresholds.read_thresholds(tmp_path, "foundation-small", "dino") is None
+    path = protocols.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
+    assert protocols.read_thresholds(tmp_path, "foundation", "dino") == thresholds
+    assert protocols.read_thresholds(tmp_path, "foundation", "other") is None
+    assert protocols.read_thresholds(tmp_path, "foundation-small", "dino") is None
     path.write_text(json.dumps({"encoder": "dino"}))
     with pytest.raises(BadOutput, match="calibration --stack foundation --keep"):
-        kept_thresholds.read_thresholds(tmp_path, "foundation", "dino")
+        protocols.read_thresholds(tmp_path, "foundation", "dino")
 
 
 def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
@@ -170,7 +170,7 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)
     monkeypatch.setenv(store.VARIABLE, str(tmp_path))
     path = run.keep_choice("foundation", report.Choice(0.6, None))
-    kept = kept_thresholds.read_thresholds(tmp_path, "foundation", TOY.encoder.name)
+    kept = protocols.read_thresholds(tmp_path, "foundation", TOY.encoder.name)
     assert path.parent == tmp_path
     assert kept == Thresholds(0.6, 0.6)
     with pytest.raises(BadOutput, match="more --scenes"):
@@ -198,7 +198,7 @@ def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, m
     with pytest.raises(BadOutput, match="more photos in the set"):
         run.keep_choice(name, report.Choice(0.6, None))
     run.keep_choice(name, report.Choice(0.6, 0.5))
-    kept = kept_thresholds.read_thresholds(tmp_path, name, TOY.encoder.name)
+    kept = protocols.read_thresholds(tmp_path, name, TOY.encoder.name)
     assert kept == Thresholds(0.6, 0.5)
 
 
@@ -218,16 +218,16 @@ def test_too_few_photos_are_answered_by_photos():
 @pytest.mark.parametrize("kind", ["familiar", "unfamiliar"])
 def test_a_kept_threshold_is_a_number(tmp_path, kind, wrong):
     thresholds = replace(Thresholds(0.5, 0.5), **{kind: float(wrong)})
-    kept_thresholds.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
+    protocols.keep_thresholds(tmp_path, "foundation", "dino", thresholds)
     with pytest.raises(BadOutput, match="thresholds-foundation.json is damaged; delete it and run"):
-        kept_thresholds.read_thresholds(tmp_path, "foundation", "dino")
+        protocols.read_thresholds(tmp_path, "foundation", "dino")
 
 
 @pytest.mark.parametrize("name", ["embedded", "embedded:encoder=dinov2-small"])
 def test_the_remedy_for_a_damaged_threshold_is_one_that_is_not_refused(name, tmp_path):
-    kept_thresholds.thresholds_file(tmp_path, name).write_text("{")
+    protocols.thresholds_file(tmp_path, name).write_text("{")
     with pytest.raises(BadOutput, match=f"run .* calibration --stack {name} --photos SET --keep"):
-        kept_thresholds.read_thresholds(tmp_path, name, "dino")
+        protocols.read_thresholds(tmp_path, name, "dino")
 
 
 def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_path, monkeypatch):
@@ -297,5 +297,5 @@ def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeyp
     assert "foundation, foundation-small: no threshold" in finding.detail
     assert "calibration --stack foundation --keep" in finding.detail
     for kind in ("foundation", "foundation-small"):
-        kept_thresholds.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
+        protocols.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
     assert machine._not_in_view().works

@@ -8,7 +8,7 @@ from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float32
 
 from tests.checked import _checked
-from vap_core.base.device import device_name
+from vap_core.base.errors import device_name
 
 Points = Float32[np.ndarray, "n 2"]
 

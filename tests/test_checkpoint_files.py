@@ -14,7 +14,7 @@ from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.lerobot.adapter import load_for_suite, load_policy
 from vap_core.policies.lerobot.checkpoints import RUN, fingerprint
-from vap_core.policies.names import label_of
+from vap_core.policies.protocol import label_of
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 from vap_core.study.store import open_run

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from tests.command import process, refused, vap
 from vap_core.cli import app
-from vap_core.instruction.history import read_uses
+from vap_core.instruction.context import read_uses
 from vap_core.memory import load_bank
 from vap_core.perception.describe import WORDS
 from vap_core.simulation.assets.objects import get_object

@@ -9,7 +9,7 @@ import trimesh
 from tests.command import vap
 from tests.scanned import put
 from vap_core import cli
-from vap_core.base.commands import command
+from vap_core.base.errors import command
 
 ODD = "a b'c $x"
 """A folder's name that a shell takes apart, unless it is quoted."""

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 
-from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadStudy
+from vap_core.base.files import rows_matching
 
 TABLE = pd.DataFrame({"steps": [1, 20, 30], "suite": ["a", "b", "b"], "margin": [0.1, 0.2, None]})
 

@@ -31,10 +31,9 @@ from vap_core.contracts.given import RenderedScene
 from vap_core.contracts.plugin import PROTOCOLS
 from vap_core.memory import register
 from vap_core.perception.stacks import load_stack
-from vap_core.policies.scripted.random import Random
-from vap_core.rollout.prompters import text
-from vap_core.rollout.prompters.protocol import PromptContext, Prompter, unchanged
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.policies.scripted.scripted import Random
+from vap_core.rollout import prompters
+from vap_core.rollout.prompters import PromptContext, Prompter, TintPrompter, unchanged
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites import SUITES, Suite
@@ -72,7 +71,7 @@ def tinting() -> TintPrompter:
     return TintPrompter(Attender(stack, {obj.name: obj}))
 
 
-@pytest.mark.parametrize("make", [text.generic, tinting])
+@pytest.mark.parametrize("make", [prompters.generic, tinting])
 def test_prompters_keep_theirs(make: Callable[[], Prompter[Any]]) -> None:
     kept(test_prompter, prompter=make(), where=WHERE)
 
@@ -431,7 +430,7 @@ def test_objects_classes_and_functions_can_be_named(
     Path("lazy_load.py").write_text("def load():\n    import beside\n    return beside.PART\n")
     Path("beside.py").write_text("PART = 7\n")
     assert given.made("lazy_load:load") == 7, "what is imported late is found, too"
-    assert isinstance(given.made("vap_core.policies.scripted.random:Random"), Random)
+    assert isinstance(given.made("vap_core.policies.scripted.scripted:Random"), Random)
     assert given.made("vap_core.simulation.suites.pick:WIDOWX") is SUITES["widowx-pick"]
     assert given.made("vap_core.perception.embedded.encoder:load").name.startswith("lite0")
     assert given.made("vap_core.vote:similarity") is similarity

@@ -10,7 +10,7 @@ from PIL import Image
 
 from vap_core.analysis import controls
 from vap_core.base.errors import UnknownName
-from vap_core.base.photos import load_photo
+from vap_core.base.media import load_photo
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from vap_core.base.types import Boxes
 from vap_core.perception.boxes import mask_iou
-from vap_core.perception.embedded import cut_segmenter
-from vap_core.perception.embedded.cut_segmenter import refine
+from vap_core.perception.embedded import segmenter
+from vap_core.perception.embedded.segmenter import refine
 
 BOX = np.array([60, 40, 180, 160], np.float32)
 TRUE = np.zeros((240, 320), np.uint8)
@@ -62,7 +62,7 @@ def test_boxes_beyond_the_edge():
 
 
 def test_familiar_views_and_small_boxes_stay_with_the_segmenter():
-    segment = cut_segmenter.load()
+    segment = segmenter.load_cut()
     xyxy = np.array([BOX, [100, 80, 130, 110]], np.float32)
     boxes = Boxes(xyxy, np.ones(2, np.float32), "disc")
     rgb = picture()

@@ -23,9 +23,8 @@ from vap_core.analysis.dataset_inspection import (
 )
 from vap_core.attend import Attender
 from vap_core.base.errors import BadDataset, BadOutput
-from vap_core.perception.embedded import weights
-from vap_core.perception.kept_thresholds import keep_thresholds, thresholds_file
-from vap_core.perception.protocols import Thresholds
+from vap_core.perception.embedded import networks
+from vap_core.perception.protocols import Thresholds, keep_thresholds, thresholds_file
 from vap_core.perception.stacks import STACKS
 from vap_core.policies.lerobot.datasets import open_dataset
 from vap_core.recording import read_summary
@@ -165,7 +164,7 @@ def test_answers_of_other_parts_or_weights_are_not_taken_for_these(
         patch.setitem(STACKS, "toys", lambda: other)
         with pytest.raises(BadOutput, match=r"another inspection \(parts differ\); choose another"):
             inspect_dataset(*ask, episodes=1)
-    monkeypatch.setattr(weights, "weights_sha256", lambda: {"tracker.npz": "0" * 64})
+    monkeypatch.setattr(networks, "weights_sha256", lambda: {"tracker.npz": "0" * 64})
     with pytest.raises(BadOutput, match=r"another inspection \(weights differ\); choose another"):
         inspect_dataset(*ask, episodes=1)
 

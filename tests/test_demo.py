@@ -18,7 +18,7 @@ from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.policies.protocol import PolicyInput
 from vap_core.recording import Recorder, read_summary, recording_name
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import TintPrompter
 from vap_core.rollout.types import Episode
 from vap_core.study.store import locked, open_run, read
 from vap_core.study.trials import DEMO, Study, make_trial, register_personal

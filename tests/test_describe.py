@@ -16,7 +16,6 @@ from tests.chat_server import says, serving
 from tests.toys import personal
 from vap_core.base.errors import BadEndpoint
 from vap_core.base.types import Boxes, Description
-from vap_core.perception.attributes import pattern_of
 from vap_core.perception.chat import (
     ChatEndpoint,
     answer_in_time,
@@ -25,13 +24,15 @@ from vap_core.perception.chat import (
     question_message,
     request_answer,
 )
-from vap_core.perception.colours import COLOURS, colour_indices
 from vap_core.perception.describe import (
+    COLOURS,
     WORDS,
     AttributeCaptioner,
     Captioner,
     ChatCaptioner,
+    colour_indices,
     load_captioner,
+    pattern_of,
     with_description,
 )
 

@@ -9,9 +9,9 @@ import pytest
 
 from tests.test_lists import gap_m
 from vap_core.base.errors import BadStudy, UnknownName
-from vap_core.policies.scripted.random import Random
+from vap_core.policies.scripted.scripted import Random
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, development, lists, simpler

@@ -12,7 +12,7 @@ from scipy.stats import ortho_group
 
 from vap_core.analysis.embeddings import compare, paired_cosines
 from vap_core.base.errors import BadPolicy
-from vap_core.policies.embedding_table import open_table
+from vap_core.policies.tables import open_table
 
 from . import tiny_lerobot
 

@@ -349,7 +349,7 @@ def test_where_every_worker_dies_the_run_ends_and_blames_no_episode(tmp_path: Pa
 def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vap_core.policies.scripted.random import Random
+    from vap_core.policies.scripted.scripted import Random
 
     class Breaks(Random):
         def plan_from_simulation(self, states, envs):  # type: ignore[no-untyped-def]

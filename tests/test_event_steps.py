@@ -13,7 +13,7 @@ from vap_core.base.types import Boxes, PersonalObject, Rgb, Track
 from vap_core.perception.protocols import Stack
 from vap_core.policies.protocol import PolicyInput
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import TintPrompter
 from vap_core.rollout.types import Episode
 from vap_core.simulation.env import Env
 from vap_core.study.trials import Study, make_trial

@@ -14,12 +14,11 @@ import torch
 from tests.command import vap
 from tests.test_hub import serving
 from vap_core import cli
-from vap_core.base import extras, files
-from vap_core.base.errors import MissingPart, MissingWeights
-from vap_core.base.extras import EXTRAS, missing_part, require
+from vap_core.base import errors, files
+from vap_core.base.errors import EXTRAS, MissingPart, MissingWeights, missing_part, require
 from vap_core.perception import text_encoder
-from vap_core.perception.embedded import lite0
-from vap_core.perception.embedded.weights import lite0_file
+from vap_core.perception.embedded import networks
+from vap_core.perception.embedded.networks import lite0_file
 from vap_core.perception.foundation import sources
 from vap_core.perception.foundation.sources import TENSORS, TEXT
 
@@ -71,7 +70,7 @@ def test_everything_but_trained_policies_works_without_the_extras(tmp_path: Path
 
 def test_what_needs_an_extra_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     require("policy", "a policy")
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "lerobot" else object())
+    monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "lerobot" else object())
     with pytest.raises(MissingPart) as caught:
         require("policy", "the policy mini-pi0")
     assert str(caught.value) == (
@@ -82,7 +81,7 @@ def test_what_needs_an_extra_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_study_with_a_trained_policy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
     done = vap("rollout", "--suite", "simpler-bridge", "--task", "put-camera", "--out", "x",
                "--policy", "mini-pi0")  # fmt: skip
     assert done.returncode == 2
@@ -199,7 +198,7 @@ def test_without_hub_and_package_both_remedies_are_named(
 
 
 def test_published_tensors_are_read_as_torch_reads_them() -> None:
-    ours = lite0.read_tensors(lite0_file())
+    ours = networks.read_tensors(lite0_file())
     theirs = torch.load(lite0_file(), map_location="cpu", weights_only=True)
     assert ours.keys() == theirs.keys()
     for name, tensor in theirs.items():
@@ -214,9 +213,9 @@ def test_a_file_of_tensors_executes_nothing(tmp_path: Path) -> None:
 
     torch.save({"weight": Harm()}, tmp_path / "bad.pth", _use_new_zipfile_serialization=False)
     with pytest.raises(
-        lite0.pickle.UnpicklingError, match="does not belong into a file of weights"
+        networks.pickle.UnpicklingError, match="does not belong into a file of weights"
     ):
-        lite0.read_tensors(tmp_path / "bad.pth")
+        networks.read_tensors(tmp_path / "bad.pth")
     assert not (tmp_path / "harm").exists()
 
 
@@ -225,8 +224,8 @@ def test_another_file_than_the_published_one_is_not_read(
 ) -> None:
     other = tmp_path / "other.pth"
     other.write_bytes(lite0_file().read_bytes() + b"0")
-    monkeypatch.setattr(lite0, "lite0_file", lambda: other)
-    lite0.folded_weights.cache_clear()
+    monkeypatch.setattr(networks, "lite0_file", lambda: other)
+    networks.folded_weights.cache_clear()
     with pytest.raises(MissingWeights, match="has SHA-256"):
-        lite0.folded_weights()
-    lite0.folded_weights.cache_clear()
+        networks.folded_weights()
+    networks.folded_weights.cache_clear()

@@ -11,9 +11,15 @@ from tests.test_rules import GOAL, OTHER, SIZES, TARGET, WHERE, row, truth
 from vap_core.base import events
 from vap_core.base.files import DATA
 from vap_core.base.types import Attended, Ballot, Boxes, Grounding, Track
-from vap_core.rollout.coverage import covered_object, mask_coverage
-from vap_core.rollout.failure import CASES
-from vap_core.rollout.types import Episode, EpisodeHeader, Frame, MaskCoverage
+from vap_core.rollout.types import (
+    CASES,
+    Episode,
+    EpisodeHeader,
+    Frame,
+    MaskCoverage,
+    covered_object,
+    mask_coverage,
+)
 from vap_core.simulation.suites.rules import rejudge
 from vap_core.simulation.types import REST, ROBOT, Outcome, Truth
 from vap_core.study import diagnosis as failures

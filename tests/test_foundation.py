@@ -28,17 +28,16 @@ from vap_core.contracts import test_detector, test_encoder, test_segmenter, test
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou
-from vap_core.perception.foundation import architectures, random_weights, runtime, sources, store
-from vap_core.perception.foundation import detector as grounding
-from vap_core.perception.foundation import encoder as dino
-from vap_core.perception.foundation import segmenter as sam
+from vap_core.perception.foundation import architectures, models, sources, store
+from vap_core.perception.foundation import models as dino
+from vap_core.perception.foundation import models as grounding
+from vap_core.perception.foundation import models as sam
 from vap_core.perception.foundation import tracker as video
-from vap_core.perception.kept_thresholds import keep_thresholds
-from vap_core.perception.protocols import Stack, Thresholds
+from vap_core.perception.protocols import Stack, Thresholds, keep_thresholds
 from vap_core.perception.stacks import load_stack
 
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-BATCHED = runtime.Runtime(torch.device("cpu"), None, batched=True)
+BATCHED = models.Runtime(torch.device("cpu"), None, batched=True)
 """As on a GPU, but in single precision."""
 Pair = tuple[np.ndarray, np.ndarray, Boxes]
 
@@ -351,11 +350,11 @@ def test_the_backbone_runs_once_per_opening_frame_and_once_per_step(
 
 
 def test_encoding_in_batches_changes_nothing_but_last_bits(parts: Stack) -> None:
-    crops = [blurred(seed, 30 + seed, 50) for seed in range(dino.BATCH + 3)]
+    crops = [blurred(seed, 30 + seed, 50) for seed in range(dino.ENCODER_BATCH + 3)]
     together = dino.CropEncoder(parts.encoder.model, dino.DINO, "batched", BATCHED)
     with Watch(together.model) as watch:
         assert np.allclose(together(crops), parts.encoder(crops), atol=1e-5)
-    assert [len(given) for given in watch.given[:2]] == [dino.BATCH, 3]
+    assert [len(given) for given in watch.given[:2]] == [dino.ENCODER_BATCH, 3]
 
 
 def session(
@@ -448,7 +447,7 @@ def test_wrong_shapes_are_refused(parts: Stack, scene: Pair) -> None:
 
 def test_half_precision_changes_little_and_ends_with_the_call(parts: Stack, scene: Pair) -> None:
     rgb, masks, boxes = scene
-    half = runtime.Runtime(torch.device("cpu"), torch.bfloat16, batched=True)
+    half = models.Runtime(torch.device("cpu"), torch.bfloat16, batched=True)
     exact = parts.encoder([rgb])
     encoder = dino.CropEncoder(parts.encoder.model, dino.DINO, "half", half)
     assert (encoder([rgb]) @ exact.T).item() > 0.995
@@ -471,14 +470,12 @@ def test_half_precision_changes_little_and_ends_with_the_call(parts: Stack, scen
 
 
 def test_the_device_is_chosen_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert runtime.select_runtime("cpu") == runtime.Runtime(
-        torch.device("cpu"), None, batched=False
-    )
+    assert models.select_runtime("cpu") == models.Runtime(torch.device("cpu"), None, batched=False)
     monkeypatch.setenv("VAP_DEVICE", "cpu")
-    assert runtime.select_runtime().device == torch.device("cpu")
+    assert models.select_runtime().device == torch.device("cpu")
     monkeypatch.setenv("VAP_DEVICE", "abacus")
     with pytest.raises(UnknownName, match="device 'abacus' is not on this machine"):
-        runtime.select_runtime()
+        models.select_runtime()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -587,7 +584,7 @@ def test_weights_of_another_architecture_are_named(weights: Path) -> None:
 def test_random_networks_have_the_published_sizes(part: str, name: str, published: int) -> None:
     """Bytes of model.safetensors at the pinned revisions: four a parameter, and its header."""
     with torch.device("meta"):
-        net = random_weights.random_network(part, name)
+        net = architectures.random_network(part, name)
     assert 4 * sum(p.numel() for p in net.parameters()) == pytest.approx(published, rel=2e-3)
 
 

@@ -18,14 +18,14 @@ from PIL import Image
 from tests.scanned import RED, box, mug
 from tests.test_scan_storage import METADATA, cube
 from tests.toys import personal
-from vap_core.base.condition import rows_matching
 from vap_core.base.errors import VapError
-from vap_core.base.photos import load_photo
+from vap_core.base.files import rows_matching
+from vap_core.base.media import load_photo
 from vap_core.instruction import parse
 from vap_core.memory import load as load_object
 from vap_core.memory import save as save_object
 from vap_core.policies.lerobot.checkpoints import PIPELINES, refuse_code
-from vap_core.policies.mini_pi0 import token_file
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.simulation.assets.scans import mesh_file, storage
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.suites import lists
@@ -94,8 +94,8 @@ def memories(folder: Path) -> list[bytes]:
 
 
 def words(folder: Path) -> list[bytes]:
-    token = token_file.Token("mug", np.zeros(4, np.float32), 0.5, "0" * 64)
-    return [token_file.save(folder, token).read_bytes()]
+    token = learned_token.Token("mug", np.zeros(4, np.float32), 0.5, "0" * 64)
+    return [learned_token.save(folder, token).read_bytes()]
 
 
 def meshes(suffix: str) -> Callable[[Path], list[bytes]]:
@@ -180,7 +180,7 @@ PARSERS = {
     ),
     "learned word": Parser(
         words,
-        reader("mug.token.safetensors", lambda f: token_file.load(f, "mug", "0" * 64)),
+        reader("mug.token.safetensors", lambda f: learned_token.load(f, "mug", "0" * 64)),
     ),
     "GLB": Parser(meshes("glb"), mesh_reader("glb")),
     "OBJ": Parser(meshes("obj"), mesh_reader("obj")),

@@ -17,7 +17,7 @@ from vap_core.analysis.plots import (
     layouts_figure,
     sheet,
 )
-from vap_core.base.figures import empty_figure
+from vap_core.base.pictures import empty_figure
 from vap_core.simulation.assets.objects import TIERS, lookalikes, personal_instance
 from vap_core.simulation.studio import PORTRAIT, Shot, Stage, photograph
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists

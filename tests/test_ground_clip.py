@@ -14,13 +14,13 @@ from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.analysis import ground, ground_clip
 from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender
-from vap_core.base import video
+from vap_core.base import media
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.memory import remember, save
-from vap_core.perception import stacks, tiles
+from vap_core.perception import boxes, stacks
+from vap_core.perception.boxes import GRID, TiledDetector, tile_corners
 from vap_core.perception.protocols import Stack
-from vap_core.perception.tiles import GRID, TiledDetector, tile_corners
 from vap_core.recording import show as film_pictures
 from vap_core.recording import write_film
 
@@ -71,9 +71,9 @@ def test_a_folder_of_frames_is_tracked_through(bank, tmp_path):
     assert "grounded in frame 5 of 9; tracked in 3 frames" in done.stdout
     assert "not visible in frames 7-7" in done.stdout
     assert "instruction: bring the " in done.stdout
-    film = list(video.frames(tmp_path / "clip.mp4"))
+    film = list(media.frames(tmp_path / "clip.mp4"))
     assert len(film) == 9
-    assert video.frame_rate(tmp_path / "clip.mp4") == ground_clip.FOLDER_HZ
+    assert media.frame_rate(tmp_path / "clip.mp4") == ground_clip.FOLDER_HZ
     changed = np.abs(film[5].astype(int) - scene(squares[5])).mean(axis=2) > 60
     assert changed[10:22, 40:52].mean() > 0.5
     assert changed[4:16, 4:16].mean() < 0.2
@@ -100,7 +100,7 @@ def test_a_clip_without_the_object_says_so(bank, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "not in view in any of 3 frames" in done.stdout
-    assert len(list(video.frames(tmp_path / "clip.mp4"))) == 3
+    assert len(list(media.frames(tmp_path / "clip.mp4"))) == 3
 
 
 def test_while_the_first_target_is_not_in_view_no_other_is_tinted(bank, tmp_path, monkeypatch):
@@ -116,7 +116,7 @@ def test_while_the_first_target_is_not_in_view_no_other_is_tinted(bank, tmp_path
     words = ("ground", clip, "put my cup near my bowl", "--stack", "toy", "--memory", bank)
     done = vap(*words, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
-    for shown in video.frames(tmp_path / "clip.mp4"):
+    for shown in media.frames(tmp_path / "clip.mp4"):
         changed = np.abs(shown.astype(int) - scene([(26, 26, GREEN)])).mean(axis=2) > 60
         assert changed.mean() < 0.02
 
@@ -195,7 +195,7 @@ def test_frames_of_two_sizes_are_one_line(bank, tmp_path):
 
 def test_a_film_of_a_clip_keeps_its_shape_and_its_pace(bank, tmp_path):
     clip = tmp_path / "wide.mp4"
-    with video.Mp4(clip, hz=20.0) as file:
+    with media.Mp4(clip, hz=20.0) as file:
         for x in range(20, 60, 2):
             file.add(np.hstack([scene([(x, 26, RED)], size=96)] * 2))
     done = vap(
@@ -203,8 +203,8 @@ def test_a_film_of_a_clip_keeps_its_shape_and_its_pace(bank, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     write_film(tmp_path / "o" / "wide.rrd", tmp_path / "film.mp4")
-    film = list(video.frames(tmp_path / "film.mp4"))
-    assert round(video.frame_rate(tmp_path / "film.mp4")) == 20
+    film = list(media.frames(tmp_path / "film.mp4"))
+    assert round(media.frame_rate(tmp_path / "film.mp4")) == 20
     assert film[0].shape == (film_pictures.SIDE_PX + 2 * film_pictures.BAR_PX, 960, 3)
     assert len(film) == 20 + 30 + 50, "the last frame is the deciding one, and stands still"
 
@@ -217,7 +217,7 @@ def test_a_film_on_a_full_disk_is_one_line(tmp_path):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     def write(pictures: int) -> int:
-        with video.Mp4(tmp_path / "film.mp4", hz=10.0) as file:
+        with media.Mp4(tmp_path / "film.mp4", hz=10.0) as file:
             whole = file._container
             file._container = SimpleNamespace(
                 add_stream=whole.add_stream, mux=full, close=whole.close
@@ -236,7 +236,7 @@ def test_a_film_on_a_full_disk_is_one_line(tmp_path):
             write(pictures)
     assert len(written) == 1, "one failed when it was closed, the other at a picture"
     assert not list(tmp_path.iterdir())
-    with pytest.raises(BadOutput, match="cannot be written"), video.Mp4(Path("/proc/f.mp4"), 10.0):
+    with pytest.raises(BadOutput, match="cannot be written"), media.Mp4(Path("/proc/f.mp4"), 10.0):
         pass
 
 
@@ -271,7 +271,7 @@ def test_tiles_find_what_the_whole_picture_is_too_coarse_for():
 
 
 def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "SMALL_MEGAPIXELS", 0.03)
+    monkeypatch.setattr(boxes, "SMALL_MEGAPIXELS", 0.03)
     rgb = scene([(150, 90, RED), (30, 30, GREEN)], size=200, side=12)
     Image.fromarray(rgb).save(tmp_path / "desk.png")
     words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy")
@@ -287,7 +287,7 @@ def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("width", "tiled"), [(400, True), (380, False)])
 def test_a_picture_is_tiled_by_the_size_of_its_file(bank, tmp_path, monkeypatch, width, tiled):
     """A long one is shrunk below the limit before it is looked at."""
-    monkeypatch.setattr(tiles, "SMALL_MEGAPIXELS", 0.07)
+    monkeypatch.setattr(boxes, "SMALL_MEGAPIXELS", 0.07)
     monkeypatch.setattr(ground, "GROUND_SIDE", 256)
     rgb = np.zeros((180, width, 3), np.uint8)
     rgb[90:130, 200:240] = RED

@@ -12,8 +12,7 @@ import pytest
 import trimesh
 
 from tests.scanned import RED, box, mug, put
-from vap_core.base.errors import BadObject
-from vap_core.base.limits import bounded
+from vap_core.base.errors import BadObject, bounded
 from vap_core.simulation.assets.scans import import_scan as importing
 from vap_core.simulation.assets.scans import mesh_file
 from vap_core.simulation.assets.scans.import_scan import import_scan

@@ -14,10 +14,9 @@ from tests import tiny_foundation
 from tests.command import vap
 from tests.local_server import running
 from vap_core.base.errors import MissingWeights, UnknownName
-from vap_core.perception.foundation import downloads, sources, store
-from vap_core.perception.foundation.downloads import pull
+from vap_core.perception.foundation import sources, store
 from vap_core.perception.foundation.sources import TENSORS, Source
-from vap_core.perception.foundation.store import LOCK, find_problem
+from vap_core.perception.foundation.store import LOCK, find_problem, pull
 
 NAME = "dinov2-base"
 SOURCE = sources.MODELS[NAME]
@@ -100,7 +99,7 @@ def serving(
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with Hub(origin, cuts, revision) as server:
         url = f"http://127.0.0.1:{server.server_port}"
-        monkeypatch.setenv(downloads.ENDPOINT_VARIABLE, url)
+        monkeypatch.setenv(store.ENDPOINT_VARIABLE, url)
         with running(server):
             yield server
 
@@ -201,7 +200,7 @@ def test_no_network_is_one_line_that_names_the_other_way(
 ) -> None:
     monkeypatch.setattr("huggingface_hub.file_download.time.sleep", lambda seconds: None)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.setenv(downloads.ENDPOINT_VARIABLE, "http://127.0.0.1:9")
+    monkeypatch.setenv(store.ENDPOINT_VARIABLE, "http://127.0.0.1:9")
     with pytest.raises(
         MissingWeights, match=r"http://127\.0\.0\.1:9/.* cannot be had \(.*refused.*--from"
     ) as caught:

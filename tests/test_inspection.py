@@ -23,7 +23,7 @@ from vap_core.analysis.inspection import (
     track_table,
 )
 from vap_core.attend import Attender
-from vap_core.base import palette
+from vap_core.base import pictures
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.base.types import Mask, Track
 from vap_core.rollout.types import Frame
@@ -157,8 +157,8 @@ def test_a_mask_is_drawn_against_what_is_there() -> None:
     assert (picture[mask_of(TEAL)] == TEAL).all()
     other = View(ROW, "front", LINE, {"mug": mask_of(GREY), "other": mask_of(TEAL)})
     wrong = np.asarray(mask_figure([other], {"front": grounding}).axes[0].images[0].get_array())
-    assert (wrong[mask_of(TEAL)] == palette.rgb8(palette.LOOKALIKES[0])).all()
-    assert (wrong[mask_of(GREY)] == palette.rgb8(palette.TARGET)).all()
+    assert (wrong[mask_of(TEAL)] == pictures.rgb8(pictures.LOOKALIKES[0])).all()
+    assert (wrong[mask_of(GREY)] == pictures.rgb8(pictures.TARGET)).all()
 
 
 def test_a_photo_has_no_truth_and_an_empty_view_no_lines() -> None:

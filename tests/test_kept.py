@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vap_core.analysis import kept
-from vap_core.base.version import code_digest
+from vap_core.base.files import code_digest
 
 
 def draw() -> Figure:

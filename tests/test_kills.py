@@ -24,7 +24,7 @@ from tests.test_report import run
 from tests.test_scan_storage import METADATA, cube
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.analysis.ground_clip import ground_clip
-from vap_core.base import video
+from vap_core.base import media
 from vap_core.memory import remember, save
 from vap_core.perception import stacks
 from vap_core.perception.protocols import Stack
@@ -78,7 +78,7 @@ def check_films(folder: Path) -> int:
     """Every film and recording that has its name is whole; returns the number of films."""
     films = list(folder.glob("[!.]*.mp4"))
     for film in films:
-        assert len(list(video.frames(film))) == 12
+        assert len(list(media.frames(film))) == 12
     for recording in folder.glob("[!.]*.rrd"):
         read_summary(recording)
     return len(films)

@@ -14,7 +14,6 @@ from safetensors.torch import load_file, save_file
 
 from tests import tiny_lerobot as tiny
 from vap_core.base.errors import BadPolicy
-from vap_core.policies.hooks import TEXT
 from vap_core.policies.lerobot import traced
 from vap_core.policies.lerobot.adapter import LeRobot, load_for_suite, load_policy
 from vap_core.policies.lerobot.checkpoints import (
@@ -24,11 +23,10 @@ from vap_core.policies.lerobot.checkpoints import (
 )
 from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.names import SHIPPED, checkpoint_of, label_of
-from vap_core.policies.protocol import Policy, PolicyInput
-from vap_core.rollout import audit
+from vap_core.policies.protocol import SHIPPED, TEXT, Policy, PolicyInput, checkpoint_of, label_of
+from vap_core.rollout import calls
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 
@@ -186,7 +184,7 @@ def test_it_tells_what_its_tensors_hold(policies, name):
         plain[0],
         replace(plain[1], images={"front": tinted}, text="put the red camera on the plate"),
     ]
-    _, _, (first, second) = audit.plan(policy, begin(policy, 2), prompted, plain)
+    _, _, (first, second) = calls.plan(policy, begin(policy, 2), prompted, plain)
     assert first[0] == first[1]
     heard, raw = second
     assert heard.keys() == ({"front", TEXT} if name in ("pi0", "pi05", "smolvla") else {"front"})
@@ -244,7 +242,7 @@ def test_a_call_that_is_made_again_or_audited_leaves_the_memory_as_it_was(polici
     audited = []
     for seen in looks:
         policy.plan(states, [look(99)])  # as of a batch that another episode failed
-        states, chunks, _ = audit.plan(policy, states, seen, [look(50)])
+        states, chunks, _ = calls.plan(policy, states, seen, [look(50)])
         audited.append(np.stack(chunks))
     assert np.array_equal(np.stack(audited), plain)
 

@@ -23,8 +23,7 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.step import LeRobotEnv, VapEnvConfig, VapPrompt, attach
 from vap_core.prompt import PALETTE, tint
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.text import generic
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import TintPrompter, generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import build

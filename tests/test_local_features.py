@@ -11,9 +11,9 @@ from vap_core.attend import Attender
 from vap_core.base.events import describe_rejection
 from vap_core.base.types import Boxes
 from vap_core.memory import remember
-from vap_core.perception.embedded import local_features
-from vap_core.perception.embedded.local_features import count_verified, find_points, is_view
-from vap_core.perception.proof import CERTAIN, GAIN, OF_USUAL, proof, usual_points
+from vap_core.perception.candidates import CERTAIN, GAIN, OF_USUAL, proof, usual_points
+from vap_core.perception.embedded import encoder
+from vap_core.perception.embedded.encoder import count_verified, find_points, is_view
 from vap_core.perception.protocols import Thresholds, Verifier
 
 RED, BLUE = (150, 40, 40), (40, 40, 150)
@@ -73,8 +73,8 @@ def test_which_maps_a_view_may_have(linear, possible):
 
 
 def test_the_verifier_keeps_its_protocol_and_the_latest_points(monkeypatch):
-    monkeypatch.setattr(local_features, "MOST_KEPT", 2)
-    verify = local_features.PointVerifier()
+    monkeypatch.setattr(encoder, "MOST_KEPT", 2)
+    verify = encoder.PointVerifier()
     assert isinstance(verify, Verifier)
     crops = [print_of(0), turned(print_of(0)), print_of(1)]
     counts = verify(crops, crops[:1])
@@ -94,7 +94,7 @@ def test_what_points_say():
 
 
 def test_the_usual_points_are_those_of_references_of_one_print():
-    verify = local_features.PointVerifier()
+    verify = encoder.PointVerifier()
     same = [print_of(0), turned(print_of(0)), turned(print_of(0), 40)]
     assert usual_points(remember("a", "box", same, MeanColour()), verify) >= 2 * CERTAIN
     several = [print_of(i) for i in range(3)]

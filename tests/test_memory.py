@@ -20,7 +20,7 @@ from PIL import Image
 from tests.scanned import EPS, fake_ghostscript
 from tests.toys import TOYS, MeanColour, personal, scene
 from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto
-from vap_core.base.photos import photos_in
+from vap_core.base.media import photos_in
 from vap_core.base.types import Description, Rgb
 from vap_core.memory import (
     kind_instead,

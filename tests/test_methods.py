@@ -18,14 +18,20 @@ from vap_core.base.errors import BadInstruction, BadMemory, BadPolicy, BadStudy
 from vap_core.base.types import Description, Views
 from vap_core.memory import load_bank
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.protocol import PolicyInput
-from vap_core.policies.weight_guard import checksum, unchanged_weights
+from vap_core.policies.protocol import PolicyInput, checksum, unchanged_weights
 from vap_core.prompt import PALETTE, tint
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
-from vap_core.rollout.prompters.protocol import PromptContext, SceneTruth
-from vap_core.rollout.prompters.text import HardPrompt, SoftPrompt, TextPrompter, hard_prompt
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import (
+    HardPrompt,
+    Oracle,
+    OraclePrompter,
+    PromptContext,
+    SceneTruth,
+    SoftPrompt,
+    TextPrompter,
+    TintPrompter,
+    hard_prompt,
+)
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Observation, Placement
 from vap_core.study import engine, trials

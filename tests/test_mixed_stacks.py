@@ -18,14 +18,11 @@ from vap_core.base.errors import MissingWeights, UnknownName
 from vap_core.contracts import test_detector, test_encoder
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
-from vap_core.perception.foundation import encoder as crops
-from vap_core.perception.foundation.architectures import quiet_transformers
-from vap_core.perception.foundation.downloads import pull
-from vap_core.perception.foundation.random_weights import letter_tokenizer
+from vap_core.perception.foundation import models as crops
+from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
 from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, models_of, parts_of
-from vap_core.perception.foundation.store import weights_table
-from vap_core.perception.kept_thresholds import keep_thresholds
-from vap_core.perception.protocols import JudgedDetector, Thresholds
+from vap_core.perception.foundation.store import pull, weights_table
+from vap_core.perception.protocols import JudgedDetector, Thresholds, keep_thresholds
 from vap_core.perception.stacks import EMBEDDED_THRESHOLDS, check_stack, load_stack, mixed
 
 __all__ = ["scene"]

@@ -12,7 +12,7 @@ import pytest
 from tests.toys import MeanColour
 from vap_core.base.errors import BadPolicy
 from vap_core.base.files import DATA
-from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.media import load_photo, photos_in
 from vap_core.base.types import Rgb
 from vap_core.memory import remember, save
 from vap_core.perception.stacks import load_stack

@@ -14,10 +14,8 @@ from vap_core.attend import Attender
 from vap_core.base.errors import BadInstruction, BadMemory, BadOutput, UnknownName
 from vap_core.base.types import Instruction, PersonalObject
 from vap_core.instruction import parse, rewrite
-from vap_core.instruction.context import Context
-from vap_core.instruction.embedding import EmbeddingParser
-from vap_core.instruction.history import FILE, MAX_USES, add_uses, read_uses
-from vap_core.instruction.owners import owners_of
+from vap_core.instruction.context import FILE, MAX_USES, Context, add_uses, owners_of, read_uses
+from vap_core.instruction.implicit import EmbeddingParser
 from vap_core.instruction.parsers import Parsing, rule_parser
 from vap_core.memory import load, load_bank, recall, save
 from vap_core.perception.text_encoder import embed_text

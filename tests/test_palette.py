@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 
 from tests.colour_vision import VISIONS, delta_e, least_difference, lightness
-from vap_core.base import figures, palette
+from vap_core.base import pictures
 
-ROLES = [palette.TARGET, palette.ELECTED, palette.GOAL, *palette.LOOKALIKES]
-METHODS = [colour for colour, _ in palette.METHODS.values()]
-SUITES = [colour for colour, _ in palette.SUITES.values()]
-TIERS = list(palette.TIERS.values())
+ROLES = [pictures.TARGET, pictures.ELECTED, pictures.GOAL, *pictures.LOOKALIKES]
+METHODS = [colour for colour, _ in pictures.METHODS.values()]
+SUITES = [colour for colour, _ in pictures.SUITES.values()]
+TIERS = list(pictures.TIERS.values())
 PALETTES = {
     "roles": (ROLES, 13),
-    "methods": ([palette.TARGET, *METHODS], 18),
-    "suites": ([palette.TARGET, *SUITES], 16),
+    "methods": ([pictures.TARGET, *METHODS], 18),
+    "suites": ([pictures.TARGET, *SUITES], 16),
     "tiers": (TIERS, 20),
-    "cases": ([palette.TARGET, *palette.CASES.values()], 11),
-    "cameras": ([palette.TARGET, *palette.CAMERAS], 17),
+    "cases": ([pictures.TARGET, *pictures.CASES.values()], 11),
+    "cameras": ([pictures.TARGET, *pictures.CAMERAS], 17),
 }
 """Every palette beside the target's colour, and the least CIEDE2000 of any two of it."""
-IN_GREY = {"methods": METHODS, "suites": SUITES, "tiers": TIERS, "cameras": palette.CAMERAS}
+IN_GREY = {"methods": METHODS, "suites": SUITES, "tiers": TIERS, "cameras": pictures.CAMERAS}
 
 
 @pytest.mark.parametrize(
@@ -53,26 +53,26 @@ def test_palettes_are_readable_in_grey(name: str) -> None:
 
 
 def test_every_method_and_suite_has_a_marker_of_its_own() -> None:
-    many = [*palette.METHODS, *"abcde"]
-    marks = palette.method_marks(many)
+    many = [*pictures.METHODS, *"abcde"]
+    marks = pictures.method_marks(many)
     assert len(set(marks.values())) == len(many)
     assert len({marker for _, marker in marks.values()}) == len(many)
-    assert len({marker for _, marker in palette.SUITES.values()}) == len(palette.SUITES)
-    assert palette.suite_colour("simpler-bridge") == palette.SUITES["simpler-bridge"][0]
-    assert palette.suite_colour("my-suite") == palette.FRAME
+    assert len({marker for _, marker in pictures.SUITES.values()}) == len(pictures.SUITES)
+    assert pictures.suite_colour("simpler-bridge") == pictures.SUITES["simpler-bridge"][0]
+    assert pictures.suite_colour("my-suite") == pictures.FRAME
 
 
 def test_every_policy_of_a_method_has_a_marker_of_its_own() -> None:
-    own = {marker for _, marker in palette.METHODS.values()}
-    further = figures.FURTHER_POLICY_MARKERS
+    own = {marker for _, marker in pictures.METHODS.values()}
+    further = pictures.FURTHER_POLICY_MARKERS
     assert len(set(further) | own) == len(further) + len(own), "they stand beside a method's own"
-    assert len(set(figures.POLICY_MARKERS)) == len(figures.POLICY_MARKERS)
+    assert len(set(pictures.POLICY_MARKERS)) == len(pictures.POLICY_MARKERS)
 
 
 def test_only_the_target_is_orange_and_only_the_goal_rose() -> None:
     names = ["cup", "mine", "tray", "pot"]
-    colours = palette.object_colours(names, target="mine", goal="tray")
-    assert colours["mine"] == palette.TARGET
-    assert colours["tray"] == palette.GOAL
-    assert {colours["cup"], colours["pot"]} == set(palette.LOOKALIKES[:2])
-    assert palette.rgb8(palette.TARGET) == (242, 142, 43)
+    colours = pictures.object_colours(names, target="mine", goal="tray")
+    assert colours["mine"] == pictures.TARGET
+    assert colours["tray"] == pictures.GOAL
+    assert {colours["cup"], colours["pot"]} == set(pictures.LOOKALIKES[:2])
+    assert pictures.rgb8(pictures.TARGET) == (242, 142, 43)

@@ -15,13 +15,10 @@ from tests.toys import personal
 from vap_core.base.errors import BadEndpoint, BadInstruction, UnknownName, VapError
 from vap_core.base.types import Description, Instruction, PersonalObject
 from vap_core.instruction import Parser, parse, rewrite
-from vap_core.instruction.chat import ChatParser
-from vap_core.instruction.context import Context
-from vap_core.instruction.embedding import EmbeddingParser
+from vap_core.instruction.context import MAX_USES, Context, Use, add_uses
 from vap_core.instruction.expressions import find_exclusions, find_expressions
-from vap_core.instruction.history import MAX_USES, Use, add_uses
-from vap_core.instruction.looks import fit
-from vap_core.instruction.parsers import Parsing, load_parser, rule_parser
+from vap_core.instruction.implicit import EmbeddingParser, fit
+from vap_core.instruction.parsers import ChatParser, Parsing, load_parser, rule_parser
 from vap_core.instruction.rule import MAX_CHARACTERS
 from vap_core.perception.chat import ChatEndpoint
 from vap_core.perception.text_encoder import embed_text

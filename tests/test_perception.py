@@ -16,14 +16,14 @@ from vap_core.contracts.given import noise, rendered_scene
 from vap_core.perception import text_encoder as text
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
 from vap_core.perception.embedded import backbone as features
-from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
+from vap_core.perception.embedded import networks
+from vap_core.perception.embedded import proposer as detect
 from vap_core.perception.embedded import segmenter as segment
-from vap_core.perception.embedded import taps, weights
 from vap_core.perception.embedded import tracker as track
 from vap_core.perception.embedded.tracker import cells
-from vap_core.perception.embedded.tracker.components import argmax_planes
-from vap_core.perception.embedded.tracker.state import RECENT
+from vap_core.perception.embedded.tracker.cells import argmax_planes
+from vap_core.perception.embedded.tracker.identities import RECENT
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +77,10 @@ def test_folded_backbone_is_the_published_one() -> None:
     image = noise(0, 224, 224)
     with torch.inference_mode():
         published = net.eval().extract_features(features.normalise(torch.from_numpy(image)[None]))
-    found = features.features([image], list(taps.CHANNELS))
+    found = features.features([image], list(networks.CHANNELS))
     assert torch.allclose(found["head"], published, atol=1e-3)
-    assert {tap: value.shape[1] for tap, value in found.items()} == taps.CHANNELS
-    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == taps.STRIDE
+    assert {tap: value.shape[1] for tap, value in found.items()} == networks.CHANNELS
+    assert {tap: 224 // value.shape[2] for tap, value in found.items()} == networks.STRIDE
 
 
 def test_text_is_minilm() -> None:
@@ -216,13 +216,13 @@ def test_tracker_memory_is_bounded(scene: tuple) -> None:
 
 def test_missing_and_damaged_weights_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingWeights, match=r"toy\.safetensors is not on this machine"):
-        weights.load_weights("toy.safetensors", folder=tmp_path)
-    weights.save_weights(
+        networks.load_weights("toy.safetensors", folder=tmp_path)
+    networks.save_weights(
         "toy.safetensors", {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, {"n": 3}, tmp_path
     )
-    tensors, about = weights.load_weights("toy.safetensors", "a.", tmp_path)
+    tensors, about = networks.load_weights("toy.safetensors", "a.", tmp_path)
     assert tensors["x"].tolist() == [1, 1]
     assert about["n"] == 3
     (tmp_path / "toy.safetensors").write_bytes(b"other")
     with pytest.raises(MissingWeights, match="SHA-256"):
-        weights.load_weights("toy.safetensors", folder=tmp_path)
+        networks.load_weights("toy.safetensors", folder=tmp_path)

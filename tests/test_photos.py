@@ -10,8 +10,8 @@ import pytest
 
 from vap_core.base.types import Rgb
 from vap_core.memory import load_photo, register
-from vap_core.perception.embedded import detector as detect
 from vap_core.perception.embedded import encoder as embed
+from vap_core.perception.embedded import proposer as detect
 from vap_core.vote import similarity, vote
 
 PHOTOS = Path(

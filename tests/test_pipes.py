@@ -9,12 +9,11 @@ import pytest
 
 from vap_core.base.errors import VapError
 from vap_core.base.files import read_file
-from vap_core.base.photos import load_photo
-from vap_core.base.video import frame_rate, frames
+from vap_core.base.media import frame_rate, frames, load_photo
 from vap_core.memory import load as load_object
 from vap_core.perception.foundation.store import read_lock
 from vap_core.policies.lerobot.checkpoints import locate
-from vap_core.policies.mini_pi0.token_file import load as load_token
+from vap_core.policies.mini_pi0.learned_token import load as load_token
 from vap_core.recording import read_summary
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 from vap_core.simulation.assets.scans.storage import load_scan

@@ -21,10 +21,9 @@ from vap_core.policies.scripted.expert import (
     _reached,
     _step_towards,
 )
-from vap_core.rollout.failure import Diagnosis
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
-from vap_core.rollout.prompters.protocol import Masks, PromptContext
+from vap_core.rollout.prompters import Masks, Oracle, OraclePrompter, PromptContext
+from vap_core.rollout.types import Diagnosis
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.env import Env

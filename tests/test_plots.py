@@ -17,8 +17,7 @@ from vap_core.analysis.plots import (
     sheet,
 )
 from vap_core.attend import Attender
-from vap_core.base.figures import write_png
-from vap_core.base.palette import METHODS, SUITES, THIN_LINES
+from vap_core.base.pictures import METHODS, SUITES, THIN_LINES, write_png
 from vap_core.perception.boxes import mask_iou
 from vap_core.study.charts import (
     cases_figure,

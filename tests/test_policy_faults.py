@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
-from vap_core.policies.hooks import TEXT, report_input
-from vap_core.policies.protocol import PolicyInput
-from vap_core.policies.scripted.random import Random
-from vap_core.rollout import policy_call as calls
+from vap_core.policies.protocol import TEXT, PolicyInput, report_input
+from vap_core.policies.scripted.scripted import Random
+from vap_core.rollout import calls
+from vap_core.rollout.calls import check_policy, checked_plan, policy_call
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.policy_call import check_policy, checked_plan, policy_call
 from vap_core.rollout.types import Episode
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import engine, trials

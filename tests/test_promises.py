@@ -12,10 +12,10 @@ import pytest
 
 import vap_core
 from vap_core import memory
-from vap_core.base import files, parquet
+from vap_core.base import files
 from vap_core.base.errors import LONGEST, BadMemory, BadObject, BadOutput, one_of
-from vap_core.instruction import history
-from vap_core.policies.mini_pi0 import token_file
+from vap_core.instruction import context
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.recording import show as viewer
 from vap_core.study import store
 
@@ -137,14 +137,14 @@ def test_a_table_that_cannot_be_opened_is_not_to_be_deleted(
 
     monkeypatch.setattr("pyarrow.parquet.read_table", refuse)
     with pytest.raises(BadOutput, match=reason) as told:
-        parquet.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
+        files.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
     assert "delete" not in str(told.value)
 
 
 READS_WHOLE_FILES = {
     "memory": (memory.load, "mug.safetensors", BadMemory),
-    "token": (lambda path: token_file.load(path.parent, "mug", "model"), "mug.token.safetensors", BadMemory),
-    "history": (lambda path: history.read_uses(path.parent), history.FILE, BadMemory),
+    "token": (lambda path: learned_token.load(path.parent, "mug", "model"), "mug.token.safetensors", BadMemory),
+    "history": (lambda path: context.read_uses(path.parent), context.FILE, BadMemory),
     "run": (lambda path: store.read_manifest(path.parent), store.MANIFEST, BadOutput),
 }  # fmt: skip
 

@@ -15,8 +15,7 @@ from vap_core.analysis.prompt_forms import (
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Camera
 from vap_core.prompt import PALETTE, Tint, has_colour, tint
-from vap_core.rollout.prompters.oracle import spoil
-from vap_core.rollout.prompters.protocol import PromptContext
+from vap_core.rollout.prompters import PromptContext, spoil
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object, texture_image
 from vap_core.study.forms import ArrowPrompter, draw_arrow, hand_pixel

@@ -12,8 +12,7 @@ from vap_core.attend import Attender
 from vap_core.base.errors import BadCrop, BadEncoder
 from vap_core.base.types import Attended, Boxes, Rgb
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.protocol import PromptContext, checked_steps, unchanged
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import PromptContext, TintPrompter, checked_steps, unchanged
 from vap_core.simulation.types import Observation
 from vap_core.study.trials import Study, make_trial
 

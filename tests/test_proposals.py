@@ -13,11 +13,17 @@ from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Boxes, Rgb
 from vap_core.memory import load, reference_box, register, save
-from vap_core.perception.embedded import open_detector, proposer
+from vap_core.perception.embedded import proposer
 from vap_core.perception.embedded.encoder import stretch_contrast
-from vap_core.perception.embedded.open_detector import AGREEMENT, OpenDetector
-from vap_core.perception.embedded.proposer import BINS, SIDE, Proposer, decode
-from vap_core.perception.embedded.weights import FOLDER, MANIFEST
+from vap_core.perception.embedded.networks import FOLDER, MANIFEST
+from vap_core.perception.embedded.proposer import (
+    AGREEMENT,
+    BINS,
+    PROPOSER_SIDE,
+    OpenDetector,
+    Proposer,
+    decode_proposals,
+)
 from vap_core.perception.protocols import Detector, Stack, Thresholds
 from vap_core.prompt import PALETTE, tint
 
@@ -110,7 +116,7 @@ def test_what_is_unlike_the_references_is_not_tinted_and_not_named() -> None:
 
 
 def test_recordings_and_signals_say_not_in_view() -> None:
-    from vap_core.base.vote_picture import result_line
+    from vap_core.base.pictures import result_line
     from vap_core.recording.texts import describe_vote
 
     _, attended = Attender(STRICT, {"mug": MUG}).start({"front": UNLIKE}, "bring my cup")
@@ -243,14 +249,14 @@ def test_a_memory_keeps_its_format_and_its_rows(tmp_path: Path) -> None:
 
 def test_decode_reads_expectations_of_edges() -> None:
     """One cell of stride 8 in row 2, column 5, whose edges lie 1, 2, 3 and 4 strides away."""
-    n_cells = sum((SIDE // stride) ** 2 for stride in proposer.STRIDES)
+    n_cells = sum((PROPOSER_SIDE // stride) ** 2 for stride in proposer.STRIDES)
     scores = np.zeros((n_cells, 80), np.float32)
     edges = np.zeros((n_cells, 4 * BINS), np.float32)
-    cell = 2 * (SIDE // 8) + 5
+    cell = 2 * (PROPOSER_SIDE // 8) + 5
     scores[cell, 7] = 0.8
     for side, strides in enumerate((1, 2, 3, 4)):
         edges[cell, side * BINS + strides] = 50.0
-    xyxy, score = decode(scores, edges)
+    xyxy, score = decode_proposals(scores, edges)
     assert len(score) == proposer.CELLS
     assert score[0] == np.float32(0.8)
     assert np.allclose(xyxy[0], [44 - 8, 20 - 16, 44 + 24, 20 + 32], atol=1e-3)
@@ -260,8 +266,8 @@ def test_proposals_scale_with_the_picture() -> None:
     """Boxes are in the picture's pixels whatever its aspect, inside it, and none fills it."""
 
     def network(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        assert pixels.shape == (1, 3, SIDE, SIDE)
-        n_cells = sum((SIDE // stride) ** 2 for stride in proposer.STRIDES)
+        assert pixels.shape == (1, 3, PROPOSER_SIDE, PROPOSER_SIDE)
+        n_cells = sum((PROPOSER_SIDE // stride) ** 2 for stride in proposer.STRIDES)
         scores = np.zeros((1, n_cells, 80), np.float32)
         edges = np.full((1, n_cells, 4 * BINS), -50.0, np.float32)
         edges[..., BINS - 1 :: BINS] = 50.0
@@ -271,7 +277,9 @@ def test_proposals_scale_with_the_picture() -> None:
 
     xyxy, score = Proposer(network)(np.zeros((100, 200, 3), np.uint8))
     assert np.allclose(score, [0.9, 0.8])
-    assert np.allclose(xyxy[0], np.array([0, 0, 84, 84]) / SIDE * [200, 100, 200, 100], atol=1e-3)
+    assert np.allclose(
+        xyxy[0], np.array([0, 0, 84, 84]) / PROPOSER_SIDE * [200, 100, 200, 100], atol=1e-3
+    )
     assert (xyxy[1][2:] == [200, 100]).all()
 
 
@@ -281,15 +289,15 @@ def test_the_shipped_detector_proposes_every_object_of_a_rendered_table() -> Non
 
     shots = stage(3, 2, held_out=True, views=1)
     true = np.array([box for _, box in boxes_of(shots.ids[0], len(shots.names), 300)], np.float32)
-    detector: Detector = open_detector.load()
+    detector: Detector = proposer.load_open()
     (found,) = detector([shots.rgb[0]], "cup")
-    assert len(found) <= open_detector.MOST_UNFAMILIAR
+    assert len(found) <= proposer.MOST_UNFAMILIAR
     overlap = box_iou(true, found.xyxy).max(axis=1)
     assert (overlap >= 0.5).mean() >= 0.8, overlap
 
 
 def test_the_proposer_ships_with_its_licence_and_source() -> None:
-    entry = json.loads((FOLDER / MANIFEST).read_text())[proposer.GRAPH]
+    entry = json.loads((FOLDER / MANIFEST).read_text())[proposer.PROPOSER_GRAPH]
     assert "Apache-2.0" in entry["licence"]
     assert "RangiLyu" in (FOLDER / "nanodet-coco.md").read_text()
     assert "Apache License" in (FOLDER / "nanodet-coco.LICENSE").read_text()

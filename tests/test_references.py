@@ -9,9 +9,9 @@ from PIL import Image
 
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
 from vap_core.analysis import drag_box, dragged_box
-from vap_core.base import video
+from vap_core.base import media
 from vap_core.base.errors import BadPhoto
-from vap_core.base.photos import load_photo
+from vap_core.base.media import load_photo
 from vap_core.base.types import Boxes
 from vap_core.memory import remember
 from vap_core.perception.protocols import Stack
@@ -236,19 +236,19 @@ def test_a_video_gives_sharp_frames_spread_over_it(tmp_path):
     for i in (2, 7, 9):
         clip[i] = sharp
     path = tmp_path / "mug.mp4"
-    with video.Mp4(path, hz=10.0) as file:
+    with media.Mp4(path, hz=10.0) as file:
         for rgb in clip:
             file.add(rgb)
-    chosen = video.sharp_frames(path, 3)
+    chosen = media.sharp_frames(path, 3)
     assert [frame.std() > 20 for frame in chosen] == [True, True, True]
     found = registering.film_photos(path, tmp_path / "frames", 2)
     assert [photo.name for photo in found] == ["mug-1.png", "mug-2.png"]
     assert load_photo(found[0]).shape == (64, 96, 3)
     with pytest.raises(BadPhoto, match="fewer than the 99"):
-        video.sharp_frames(path, 99)
+        media.sharp_frames(path, 99)
     (tmp_path / "no.mp4").write_bytes(b"no video")
     with pytest.raises(BadPhoto, match="cannot be decoded"):
-        video.sharp_frames(tmp_path / "no.mp4", 1)
+        media.sharp_frames(tmp_path / "no.mp4", 1)
 
 
 def test_a_photo_of_a_phone_is_read(tmp_path):

@@ -18,8 +18,7 @@ from scipy.stats import binomtest
 
 from tests.command import vap
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA
-from vap_core.base.tables import markdown
+from vap_core.base.files import DATA, markdown
 from vap_core.simulation import suites
 from vap_core.study.report import conclude, report
 from vap_core.study.results import errors, load_runs, outcomes, publish, results

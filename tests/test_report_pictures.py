@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.test_report import run
-from vap_core.base import palette
+from vap_core.base import pictures
 from vap_core.base.errors import BadRecording
 from vap_core.recording import recording_file_name
 from vap_core.simulation import suites
@@ -83,13 +83,13 @@ def test_pictures_show_every_line_and_overlap_nothing(tmp_path: Path) -> None:
 
 
 def test_methods_are_told_apart_by_colour_and_by_marker() -> None:
-    marks = palette.method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
+    marks = pictures.method_marks(["generic", "vap", "mask-only", "rewrite-only", "vap-associated"])
     assert (
         len({colour for colour, _ in marks.values()})
         == len({marker for _, marker in marks.values()})
         == 5
     )
-    assert marks["vap"] == palette.METHODS["vap"]
+    assert marks["vap"] == pictures.METHODS["vap"]
 
 
 def test_policies_of_one_method_are_told_apart(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_policies_of_one_method_are_told_apart(tmp_path: Path) -> None:
             handle[0].get_markerfacecolor(),
         )
     assert len(labels) == len(set(marks.values())) == 8
-    colour, marker = palette.METHODS["vap"]
+    colour, marker = pictures.METHODS["vap"]
     assert marks["vap, a policy"] == (colour, marker, colour)
     assert marks["vap, b policy"] == (colour, marker, "white")
 
@@ -130,7 +130,7 @@ def test_a_difference_is_filled_after_holms_correction_alone(tmp_path: Path) -> 
         figure = differences_figure([replace(compared, p=0.03, p_holm=p_holm)])
         (container,) = figure.axes[0].containers
         pictured.append(container.lines[0].get_markerfacecolor())
-    assert pictured == ["white", palette.METHODS["vap"][0]]
+    assert pictured == ["white", pictures.METHODS["vap"][0]]
 
 
 def test_a_rate_is_drawn_with_the_interval_over_layouts(tmp_path: Path) -> None:

@@ -14,26 +14,16 @@ from tests.command import process
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
 from vap_core.perception.boxes import crop, mask_iou
-from vap_core.perception.embedded import (
-    detect_network,
-    detector,
-    encode_network,
-    encoder,
-    lite0,
-    mask_network,
-    runtime,
-    segmenter,
-    taps,
-    tracker,
-)
-from vap_core.perception.embedded.tracker import cell_network, cells
-from vap_core.perception.embedded.weights import FOLDER, MANIFEST, PERCEPTION, load_weights
+from vap_core.perception.embedded import encoder, networks, proposer, segmenter, tracker
+from vap_core.perception.embedded.networks import FOLDER, MANIFEST, PERCEPTION, load_weights
+from vap_core.perception.embedded.tracker import cells
+from vap_make.perception import graphs
 
 BOUNDS = {
     cells.GRAPH: (1e-5,),
     segmenter.GRAPH: (1e-5,),
     encoder.GRAPH: (1e-4, 1e-5),
-    detector.GRAPH: (1e-4, 1e-3),
+    proposer.GRAPH: (1e-4, 1e-3),
 }
 """The largest difference allowed, by output: unit-length features, probabilities, features of up to
 6, a row of length 1, logits of up to 10, and edges of up to 20 cells."""
@@ -43,9 +33,9 @@ def modules() -> dict[str, nn.Module]:
     """The torch networks with the shipped weights."""
     heads: list[nn.Module] = []
     for prefix, build in (
-        ("segment.", mask_network.MaskHead),
-        ("look.", encode_network.InstanceHead),
-        ("detect.", detect_network.DetectHead),
+        ("segment.", graphs.MaskHead),
+        ("look.", graphs.InstanceHead),
+        ("detect.", graphs.DetectHead),
     ):
         weights, _ = load_weights(PERCEPTION, prefix)
         head = build(len(weights["known"])) if prefix == "detect." else build()  # type: ignore[call-arg]
@@ -53,30 +43,30 @@ def modules() -> dict[str, nn.Module]:
         heads.append(head)
     mask, look, detect = heads
     return {
-        cells.GRAPH: cell_network.CellNetwork(),
-        segmenter.GRAPH: mask_network.MaskNetwork(mask),
-        encoder.GRAPH: encode_network.EncodeNetwork(look),
-        detector.GRAPH: detect_network.DetectNetwork(detect),
+        cells.GRAPH: graphs.CellNetwork(),
+        segmenter.GRAPH: graphs.MaskNetwork(mask),
+        encoder.GRAPH: graphs.EncodeNetwork(look),
+        proposer.GRAPH: graphs.DetectNetwork(detect),
     }
 
 
 @pytest.fixture(scope="module")
-def by_torch() -> dict[str, runtime.TorchNetwork]:
-    return {name: runtime.TorchNetwork(module) for name, module in modules().items()}
+def by_torch() -> dict[str, networks.TorchNetwork]:
+    return {name: networks.TorchNetwork(module) for name, module in modules().items()}
 
 
 @pytest.fixture(scope="module")
-def by_onnx() -> dict[str, runtime.Network]:
+def by_onnx() -> dict[str, networks.Network]:
     return {
         cells.GRAPH: tracker.load().network,
         segmenter.GRAPH: segmenter.load().network,
         encoder.GRAPH: encoder.load().network,
-        detector.GRAPH: detector.load().network,
+        proposer.GRAPH: proposer.load().network,
     }
 
 
 @pytest.fixture(scope="module")
-def torch_tracker(by_torch: dict[str, runtime.TorchNetwork]) -> tracker.LiteTracker:
+def torch_tracker(by_torch: dict[str, networks.TorchNetwork]) -> tracker.LiteTracker:
     return tracker.LiteTracker(
         by_torch[cells.GRAPH],
         segmenter.LiteSegmenter(by_torch[segmenter.GRAPH]),
@@ -104,7 +94,7 @@ def inputs(name: str, picture: np.ndarray, seed: int) -> list[np.ndarray]:
     """What a network is given for a picture."""
     rng = np.random.default_rng(seed)
     if name == cells.GRAPH:
-        return [taps.resize_and_pad(picture, cells.SIDE)[0][None]]
+        return [networks.resize_and_pad(picture, cells.SIDE)[0][None]]
     if name == segmenter.GRAPH:
         planes = rng.integers(0, 256, (1, 2, segmenter.SIDE, segmenter.SIDE), dtype=np.uint8)
         return [segmenter.cut(picture, (0, 0, min(picture.shape[:2])))[None], planes]
@@ -112,14 +102,14 @@ def inputs(name: str, picture: np.ndarray, seed: int) -> list[np.ndarray]:
         whole = encoder.pad_to_square(picture)
         colour = encoder.lab_histogram(picture).astype(np.float32)
         return [whole[None], whole[None, ::2, ::2].copy(), colour[None] / np.linalg.norm(colour)]
-    return [detector.resize_for_search(picture)[0][None], detector.load().embed_phrase("cup")]
+    return [proposer.resize_for_search(picture)[0][None], proposer.load().embed_phrase("cup")]
 
 
 @pytest.mark.parametrize("name", BOUNDS)
 def test_both_runtimes_give_the_same_numbers(
     name: str,
-    by_torch: dict[str, runtime.TorchNetwork],
-    by_onnx: dict[str, runtime.Network],
+    by_torch: dict[str, networks.TorchNetwork],
+    by_onnx: dict[str, networks.Network],
     scene: tuple,
 ) -> None:
     for seed, picture in enumerate([scene[0], noise(0, 224, 224), noise(1, 90, 160)]):
@@ -135,12 +125,12 @@ def test_both_runtimes_give_the_same_numbers(
 
 
 def test_both_runtimes_give_the_same_boxes_masks_and_rows(
-    by_torch: dict[str, runtime.TorchNetwork], scene: tuple
+    by_torch: dict[str, networks.TorchNetwork], scene: tuple
 ) -> None:
     rgb, _, boxes = scene
-    reference = detector.LiteDetector(by_torch[detector.GRAPH], detector.load().known)
+    reference = proposer.LiteDetector(by_torch[proposer.GRAPH], proposer.load().known)
     for found, expected in zip(
-        detector.load()([rgb, rgb[:100]], "bottle"),
+        proposer.load()([rgb, rgb[:100]], "bottle"),
         reference([rgb, rgb[:100]], "bottle"),
         strict=True,
     ):
@@ -174,7 +164,7 @@ def test_both_runtimes_track_a_clip_alike(torch_tracker: tracker.LiteTracker, sc
 
 
 def test_a_session_takes_one_thread() -> None:
-    options = runtime.session_options()
+    options = networks.session_options()
     assert (options.intra_op_num_threads, options.inter_op_num_threads) == (1, 1)
 
 
@@ -185,10 +175,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "weights"
 
 
-def load_tracker(folder: Path) -> runtime.OnnxNetwork:
+def load_tracker(folder: Path) -> networks.OnnxNetwork:
     entries = json.loads((FOLDER / MANIFEST).read_text())
-    return runtime.load_network(
-        cells.GRAPH, lite0.trunk_weights([cells.TAP]), entries[PERCEPTION]["sha256"], folder
+    return networks.load_network(
+        cells.GRAPH, networks.trunk_weights([cells.TAP]), entries[PERCEPTION]["sha256"], folder
     )
 
 
@@ -220,7 +210,7 @@ def test_a_damaged_graph_is_refused(
 
 def test_a_graph_of_other_weights_is_refused(folder: Path) -> None:
     with pytest.raises(MissingWeights, match=r"was made with e0ec.*; run python .* export"):
-        runtime.load_network(cells.GRAPH, lite0.trunk_weights([cells.TAP]), "0" * 64, folder)
+        networks.load_network(cells.GRAPH, networks.trunk_weights([cells.TAP]), "0" * 64, folder)
 
 
 def test_the_shipped_graphs_are_those_of_the_networks(folder: Path) -> None:

@@ -21,13 +21,11 @@ from vap_core.base.errors import MissingWeights
 from vap_core.contracts import test_detector, test_segmenter, test_tracker
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
-from vap_core.perception.foundation import sam3
-from vap_core.perception.foundation.architectures import quiet_transformers
-from vap_core.perception.foundation.downloads import pull
-from vap_core.perception.foundation.edgetam import backbone_without_hub
-from vap_core.perception.foundation.random_weights import random_network
+from vap_core.perception.foundation import models
+from vap_core.perception.foundation.architectures import quiet_transformers, random_network
 from vap_core.perception.foundation.sources import MODELS, TENSORS, models_of
-from vap_core.perception.foundation.store import weights_table
+from vap_core.perception.foundation.store import pull, weights_table
+from vap_core.perception.foundation.tracker import backbone_without_hub
 from vap_core.perception.stacks import mixed
 
 __all__ = ["scene"]
@@ -236,13 +234,13 @@ def test_boxes_are_those_of_transformers_post_processing(detector: Any, scene: P
         assert np.allclose(boxes[match], box, atol=0.05)
         assert theirs["scores"][match].item() == pytest.approx(score, abs=1e-4)
     for threshold in (None, 0.6):
-        least = sam3.THRESHOLD if threshold is None else threshold
+        least = models.SAM3_THRESHOLD if threshold is None else threshold
         assert (detector([rgb], "owl statue", threshold)[0].score >= least).all()
 
 
 def test_a_phrase_is_read_once_for_all_images_and_changes_the_boxes(detector: Any) -> None:
     images = [blurred(seed, 60, 80) for seed in (0, 1)]
-    together = sam3.Sam3Detector(detector.model, detector.tokenizer, BATCHED)
+    together = models.Sam3Detector(detector.model, detector.tokenizer, BATCHED)
     with Watch(detector.model.vision_encoder) as watch:
         found = together(images, "cup", 0.0)
     assert [len(given) for given in watch.given] == [2]

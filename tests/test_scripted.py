@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from vap_core.base.types import Boxes, Camera, Rgb
 from vap_core.policies.protocol import PolicyInput
-from vap_core.policies.scripted.localizer import coloured, read
-from vap_core.policies.scripted.scripted import SPEED_M_S, Scripted, ScriptedState
+from vap_core.policies.scripted.scripted import SPEED_M_S, Scripted, ScriptedState, coloured, read
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 

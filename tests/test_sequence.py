@@ -9,12 +9,11 @@ import pytest
 
 from tests.drawn import columns
 from vap_core.base.errors import BadInstruction
-from vap_core.instruction.sequence import decompose
+from vap_core.instruction.expressions import decompose
 from vap_core.policies.scripted.expert import Expert
 from vap_core.recording import Recorder
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.protocol import unchanged
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic, unchanged
 from vap_core.simulation import homing
 from vap_core.simulation.suites import lists
 from vap_core.simulation.suites.open_row import build_scene, open_row

@@ -11,10 +11,10 @@ import pytest
 from vap_core.base.errors import BadInstruction, BadStudy, BadSuite, UnknownName
 from vap_core.base.files import DATA
 from vap_core.base.types import PersonalObject
+from vap_core.instruction.expressions import decompose
 from vap_core.instruction.parsers import rule_parser
-from vap_core.instruction.sequence import decompose
 from vap_core.memory import recall
-from vap_core.policies.scripted.localizer import read
+from vap_core.policies.scripted.scripted import read
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import SHARED, lists, shared

@@ -12,14 +12,13 @@ from lerobot.policies import make_pre_post_processors
 from vap_core.base.errors import BadMemory, BadStudy
 from vap_core.contracts import test_suite
 from vap_core.policies.lerobot.checkpoints import config_field
-from vap_core.policies.mini_pi0 import learned_token, teach_token
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
-from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining
+from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining, photographs
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
-from vap_core.policies.mini_pi0.teach_token import photographs
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
-from vap_core.policies.names import SHIPPED
-from vap_core.rollout.prompters.text import TextPrompter, soft_prompt
+from vap_core.policies.protocol import SHIPPED
+from vap_core.rollout.prompters import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, wording
@@ -107,7 +106,7 @@ def test_photos_show_the_target_its_look_alikes_and_others() -> None:
     assert (len(photos.own), len(photos.rivals), len(photos.others)) == (
         5,
         12 * len(rivals),
-        5 * teach_token.OTHERS,
+        5 * learned_token.OTHERS,
     )
     assert {objects.get_object(name).category for name in rivals} == {"camera"}
     unseen = photographs(rows, 1, 5)
@@ -118,8 +117,8 @@ def test_it_runs_as_a_method_and_the_policy_stays(
     grown: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home, far = grown
-    monkeypatch.setattr(teach_token, "MODEL", home)
-    monkeypatch.setattr(teach_token, "VIEWS", 2)
+    monkeypatch.setattr(learned_token, "MODEL", home)
+    monkeypatch.setattr(learned_token, "VIEWS", 2)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=2, augmentations=1)
     )
@@ -155,8 +154,8 @@ def test_one_object_has_a_token_for_every_model_and_its_look_alikes(
     monkeypatch.setattr(
         "vap_core.study.trials.shipped", lambda suite: tmp_path / f"policy-{policies[suite]}"
     )
-    monkeypatch.setattr(teach_token, "MODEL", tmp_path / MODEL)
-    monkeypatch.setattr(teach_token, "VIEWS", 2)
+    monkeypatch.setattr(learned_token, "MODEL", tmp_path / MODEL)
+    monkeypatch.setattr(learned_token, "VIEWS", 2)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
     )
@@ -179,8 +178,8 @@ def test_one_object_has_a_token_for_every_model_and_its_look_alikes(
 def test_the_shipped_model_that_a_policy_grew_from_is_found() -> None:
     for name, model in (("simpler-bridge-wide-seed-0", "-tint-free"),):
         grew_from = config_field(SHIPPED / f"mini-pi0-{name}", "vlm")
-        assert teach_token.model_of(grew_from) == SHIPPED / f"mini-paligemma{model}"
-    assert teach_token.model_of("f" * 64) == teach_token.MODEL, "which is then refused"
+        assert learned_token.model_of(grew_from) == SHIPPED / f"mini-paligemma{model}"
+    assert learned_token.model_of("f" * 64) == learned_token.MODEL, "which is then refused"
 
 
 def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path: Path) -> None:
@@ -190,7 +189,7 @@ def test_a_policy_of_another_model_is_refused(grown: tuple[Path, Path], tmp_path
             BadStudy,
             match=f"the policy was initialised from {told}, but the model in .* leave soft out",
         ):
-            teach_token.teach(rows, tmp_path, sha, grown[0])
+            learned_token.teach(rows, tmp_path, sha, grown[0])
 
 
 def test_a_policy_without_words_is_refused() -> None:

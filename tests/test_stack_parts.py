@@ -9,17 +9,12 @@ import pytest
 from tests.toys import MeanColour, SameColour, segmenter
 from vap_core.attend import Attender, Prompting
 from vap_core.base.files import DATA
-from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.media import load_photo, photos_in
 from vap_core.base.types import Boxes, Rgb
 from vap_core.memory import remember
 from vap_core.perception import foundation
-from vap_core.perception.embedded import cut_segmenter
-from vap_core.perception.protocols import (
-    FamiliarityJudge,
-    JudgedDetector,
-    ReferenceCropper,
-    Stack,
-)
+from vap_core.perception.embedded import segmenter as embedded_segmenter
+from vap_core.perception.protocols import FamiliarityJudge, JudgedDetector, ReferenceCropper, Stack
 from vap_core.perception.stacks import load_mixed, load_stack
 
 PHOTOS = DATA / "photo-set"
@@ -105,7 +100,7 @@ def test_a_photo_has_its_encoder_and_grabcut_with_another_detector(
     def refine(image: Rgb, box: np.ndarray, probability: np.ndarray) -> None:
         refined.append(box)
 
-    monkeypatch.setattr(cut_segmenter, "refine", refine)
+    monkeypatch.setattr(embedded_segmenter, "refine", refine)
     crops = [load_photo(path) for path in photos_in(PHOTOS / "references" / "cookies")]
     memory = {"cookies": remember("cookies", "cookies", crops, stack.encoder)}
     _, attended = Attender(stack, memory, Prompting()).start({"front": photo}, "bring my cookies")

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.base.figures import write_png
+from vap_core.base.pictures import write_png
 from vap_core.study import charts
 from vap_core.study.perception import KS, OFF, RULES
 from vap_core.study.stats import rate

@@ -17,10 +17,10 @@ from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, Unkn
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.cli import app
-from vap_core.policies.embedding_table import open_table
-from vap_core.policies.mini_pi0 import learned_token, teach_token, token_alignment, token_file
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_from_policy, load_vlm
+from vap_core.policies.tables import open_table
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.study import engine, tokens, trials
@@ -38,9 +38,9 @@ def tiny(
 ) -> tuple[Path, Path]:
     """A tiny model and policy in place of those that ship, and few photos."""
     home, far = grown
-    monkeypatch.setattr(teach_token, "MODEL", home)
-    monkeypatch.setattr(teach_token, "VIEWS", 2)
-    monkeypatch.setattr(teach_token, "OTHERS", 1)
+    monkeypatch.setattr(learned_token, "MODEL", home)
+    monkeypatch.setattr(learned_token, "VIEWS", 2)
+    monkeypatch.setattr(learned_token, "OTHERS", 1)
     monkeypatch.setattr(tokens, "shipped", lambda suite: far)
 
     def views(model: ObjectModel, n: int = 5, seed: int = 0) -> list[Rgb]:
@@ -48,7 +48,7 @@ def tiny(
         rng = np.random.default_rng([seed, n, *model.name.encode()])
         return list(rng.integers(0, 256, (n, 32, 32, 3)).astype(np.uint8))
 
-    for module in (tokens, teach_token):
+    for module in (tokens, learned_token):
         monkeypatch.setattr(module, "reference_views", views)
 
     def training(epochs: int = 2) -> TokenTraining:
@@ -62,7 +62,7 @@ def tiny(
         """Two episodes of noise in place of rendered views."""
         rows = suites.rows(suite, task)
         target = rows[0].target
-        names = (target, teach_token.lookalikes(rows)[0])
+        names = (target, learned_token.lookalikes(rows)[0])
         rng = np.random.default_rng(0)
         crops = {
             name: tuple(rng.integers(0, 256, (2, 32, 32, 3)).astype(np.uint8)) for name in names
@@ -86,7 +86,7 @@ def test_what_no_word_says_stays_as_it_is() -> None:
     source[:, :8] = rng.normal(size=(8, 8))
     target = np.zeros_like(source)
     target[:, :8] = source[:, :8] @ ortho_group.rvs(8, random_state=1)
-    found = token_alignment.orthogonal_map(source, target)
+    found = learned_token.orthogonal_map(source, target)
     assert np.allclose(found[8:, 8:], np.eye(8), atol=1e-4)
     assert np.allclose(source @ found, target, atol=0.05)
 
@@ -111,7 +111,7 @@ def test_tokens_of_other_spaces_are_methods(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     home, far = tiny
-    monkeypatch.setattr(teach_token, "MODEL", home)
+    monkeypatch.setattr(learned_token, "MODEL", home)
     monkeypatch.setattr(
         learned_token, "TokenTraining", lambda: TokenTraining(epochs=1, augmentations=1)
     )
@@ -123,14 +123,14 @@ def test_tokens_of_other_spaces_are_methods(
     trial = trials.make_trial(asked, [row], method, bank)
     assert trial.prompter.rewrite(row.instruction) == "put <my_0> on the plate"
     (used,) = trial.policy.learned.values()
-    suffix = token_file.OWN_SUFFIX if method == "soft-own" else token_file.SUFFIX
+    suffix = learned_token.OWN_SUFFIX if method == "soft-own" else learned_token.SUFFIX
     model = load_from_policy(far) if method == "soft-own" else load_vlm(home)
     rows = asked.rows(SUITE, TASK)
-    suffix = teach_token.file_suffix(rows, model.sha256(), suffix)
-    token = token_file.load(bank, row.target, model.sha256(), suffix)
+    suffix = learned_token.file_suffix(rows, model.sha256(), suffix)
+    token = learned_token.load(bank, row.target, model.sha256(), suffix)
     expected = token.embedding
     if method == "soft-aligned":
-        expected = token_alignment.align(token.embedding, home, far)
+        expected = learned_token.align(token.embedding, home, far)
     assert np.allclose(used.numpy(), expected)
     (bank / f"{row.target}{suffix}").unlink()
     with pytest.raises(BadMemory, match="no learned word"):
@@ -162,7 +162,7 @@ def test_the_study_measures_every_token_and_goes_on(
     assert widths == {16}
     learned = tables["embeddings"].set_index("learned_in").embedding
     rows = suites.rows(SUITE, tables["embeddings"].task[0])
-    taught = teach_token.photographs(rows, 0, 5)
+    taught = learned_token.photographs(rows, 0, 5)
     training = TokenTraining(epochs=2, augmentations=1)
     *_, (_, method) = learned_token.lessons(load_vlm(tiny[0]), rows[0].target, taught, training)
     assert np.allclose(learned["vlm"], method, atol=1e-5)
@@ -405,6 +405,6 @@ def test_a_rotation_is_found_again() -> None:
     turn = ortho_group.rvs(16, random_state=1)
     source = rng.normal(size=(60, 16)).astype(np.float32)
     target = (source @ turn).astype(np.float32)
-    found = token_alignment.orthogonal_map(source, target)
+    found = learned_token.orthogonal_map(source, target)
     assert np.allclose(found, turn, atol=1e-2)
     assert np.allclose(found @ found.T, np.eye(16), atol=1e-6)

@@ -11,16 +11,17 @@ import torch
 from vap_core.base.errors import BadMemory, BadPolicy
 from vap_core.base.types import Rgb
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.mini_pi0 import token_file
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import (
+    SUFFIX,
     WORD,
     Photos,
+    Token,
     TokenTraining,
     answers,
     augment,
     learn,
 )
-from vap_core.policies.mini_pi0.token_file import SUFFIX, Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
 from vap_core.policies.protocol import PolicyInput
 from vap_make.words import vocabulary
@@ -142,17 +143,17 @@ def test_an_oblong_photo_keeps_both_halves(h_w: tuple[int, int]) -> None:
 
 def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> None:
     token = Token("red-mug", np.arange(4, dtype=np.float32), 0.96875, "f" * 64)
-    path = token_file.save(tmp_path, token)
-    back = token_file.load(tmp_path, "red-mug", "f" * 64)
+    path = learned_token.save(tmp_path, token)
+    back = learned_token.load(tmp_path, "red-mug", "f" * 64)
     assert (back.object, back.accuracy, back.model) == (token.object, token.accuracy, token.model)
     assert np.array_equal(back.embedding, token.embedding)
     with pytest.raises(BadMemory, match="learned in model ffffffff"):
-        token_file.load(tmp_path, "red-mug", "e" * 64)
+        learned_token.load(tmp_path, "red-mug", "e" * 64)
     with pytest.raises(BadMemory, match="no learned word"):
-        token_file.load(tmp_path, "blue-mug", "f" * 64)
+        learned_token.load(tmp_path, "blue-mug", "f" * 64)
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(BadMemory, match="no learned word"):
-        token_file.load(tmp_path, "red-mug", "f" * 64)
+        learned_token.load(tmp_path, "red-mug", "f" * 64)
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"object": "blue-mug"}, "is the word of 'blue-mug', not of 'red-mug'"),
         ({"embedding": np.array([1.0, np.nan], np.float32)}, "has numbers that are not finite"),
@@ -160,16 +161,16 @@ def test_a_token_comes_back_from_disk_for_its_own_model_only(tmp_path: Path) -> 
         ({"accuracy": float("nan")}, "has an accuracy of nan, not from 0 to 1"),
     ]
     for change, said in wrong:
-        token_file.save(tmp_path, replace(token, **change)).rename(path)
+        learned_token.save(tmp_path, replace(token, **change)).rename(path)
         with pytest.raises(BadMemory, match=said):
-            token_file.load(tmp_path, "red-mug", "f" * 64)
+            learned_token.load(tmp_path, "red-mug", "f" * 64)
     assert path.name == f"red-mug{SUFFIX}"
-    saved = {token_file.save(tmp_path, token).read_bytes() for _ in range(6)}
+    saved = {learned_token.save(tmp_path, token).read_bytes() for _ in range(6)}
     assert len(saved) == 1
     deep = b"[" * 100_000
     path.write_bytes(len(deep).to_bytes(8, "little") + deep)
     with pytest.raises(BadMemory, match="no learned word"):
-        token_file.load(tmp_path, "red-mug", "f" * 64)
+        learned_token.load(tmp_path, "red-mug", "f" * 64)
 
 
 def test_a_policy_hears_the_word_and_its_weights_stay(checkpoint: Path) -> None:  # noqa: F811

@@ -10,13 +10,16 @@ import pytest
 import torch
 
 from vap_core.base.errors import BadPolicy
-from vap_core.policies.hooks import observe_attention, observe_inputs
 from vap_core.policies.lerobot import traced
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
 from vap_core.policies.lerobot.traced import ChunkPredictor
 from vap_core.policies.mini_pi0.learned_token import WORD
-from vap_core.policies.protocol import PolicyInput
-from vap_core.policies.weight_guard import unchanged_weights
+from vap_core.policies.protocol import (
+    PolicyInput,
+    observe_attention,
+    observe_inputs,
+    unchanged_weights,
+)
 from vap_core.simulation import suites
 from vap_core.study.trials import shipped
 

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from vap_core.base.types import Track
 from vap_core.perception.boxes import mask_iou
 from vap_core.perception.embedded import tracker as track
-from vap_core.perception.embedded.tracker import appearance, cells, state
+from vap_core.perception.embedded.tracker import cells, identities
 
 RED, BLUE, TEAL = (200, 40, 40), (40, 60, 200), (20, 150, 140)
 SIZE = 128
@@ -170,7 +170,7 @@ def test_memory_does_not_grow() -> None:
     for t in range(1, 31):
         states, _ = tracker.step(states, [paint((RED, 40 + t % 2, 60), (BLUE, 90, 60))[0]])
         seen[t] = (size(states[0]), [crop.size for crop in states[0].last_crops])
-        assert len(states[0].recent) <= state.RECENT
+        assert len(states[0].recent) <= identities.RECENT
     assert seen[30][0] - sum(seen[30][1]) == seen[5][0] - sum(seen[5][1])
     assert (
         max(sum(of) for _, of in seen.values()) <= 2 * 3 * SIZE * SIZE
@@ -190,26 +190,26 @@ def test_an_unchanged_view_costs_no_features(monkeypatch: pytest.MonkeyPatch) ->
     assert after[0] is not states[0]
 
 
-@given(hnp.arrays(np.float32, int(np.prod(appearance.BINS)), elements=st.floats(0, 1, width=16)))
+@given(hnp.arrays(np.float32, int(np.prod(cells.BINS)), elements=st.floats(0, 1, width=16)))
 def test_whatever_is_familiar_stays_so_when_colours_spread(shares: np.ndarray) -> None:
     tone = (shares / max(float(shares.sum()), 1e-6)).astype(np.float32)
-    wide = appearance.blur_shares(tone)
+    wide = cells.blur_shares(tone)
     assert (wide >= tone).all()
-    assert abs(appearance.familiar_share(tone, wide) - tone.sum()) < 1e-4
-    assert appearance.familiar_share(tone, np.zeros_like(tone)) == 0
+    assert abs(cells.familiar_share(tone, wide) - tone.sum()) < 1e-4
+    assert cells.familiar_share(tone, np.zeros_like(tone)) == 0
 
 
 def test_a_third_of_an_object_is_as_familiar_as_the_whole_and_a_plate_is_not() -> None:
     image, (mask,) = paint((RED, 64, 64))
-    known, part = appearance.colour_shares(image, mask), mask & (np.arange(SIZE)[:, None] > 68)
-    assert appearance.familiar_share(appearance.colour_shares(image, part), known) > 0.9
-    assert appearance.familiar_share(appearance.colour_shares(wood(), mask), known) < 0.3
-    assert not appearance.colour_shares(image, np.zeros_like(mask)).any()
+    known, part = cells.colour_shares(image, mask), mask & (np.arange(SIZE)[:, None] > 68)
+    assert cells.familiar_share(cells.colour_shares(image, part), known) > 0.9
+    assert cells.familiar_share(cells.colour_shares(wood(), mask), known) < 0.3
+    assert not cells.colour_shares(image, np.zeros_like(mask)).any()
 
 
 def test_appearances_are_measured_against_bare_surroundings_and_against_each_other() -> None:
     rows = np.eye(3, dtype=np.float32)[:2]
-    known = appearance.Appearances(rows, np.array([0.4, 0.4], np.float32))
+    known = cells.Appearances(rows, np.array([0.4, 0.4], np.float32))
     tilted = np.array([0.5, 0.6, np.sqrt(0.39)], np.float32)
     assert known.accept(tilted, rows[1], 1)
     assert not known.accept(tilted, rows[0], 0)  # more like the other
@@ -218,7 +218,7 @@ def test_appearances_are_measured_against_bare_surroundings_and_against_each_oth
         np.array([0.3, 0.0, np.sqrt(0.91)], np.float32), rows[0], 0
     )  # like nothing in particular
     boxes = np.array([[0, 0, 40, 40], [88, 0, 128, 40]], np.float32)
-    assert appearance.background_crop(
+    assert cells.background_crop(
         np.arange(SIZE * SIZE * 3, dtype=np.uint8).reshape(SIZE, SIZE, 3), boxes
     ).shape[:2] <= (44, 44)
 
@@ -240,12 +240,14 @@ def test_cells_lead_where_they_belong() -> None:
 
 def test_changes_near_an_identity_are_noticed() -> None:
     image, masks = paint((RED, 40, 60))
-    begun = state.initial_state(image, masks, track.load().network)
-    assert not state.changed_nearby(begun, state.thumbnail_of(image)).any()
-    assert not state.changed_nearby(
-        begun, state.thumbnail_of(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))
+    begun = identities.initial_state(image, masks, track.load().network)
+    assert not identities.changed_nearby(begun, identities.thumbnail_of(image)).any()
+    assert not identities.changed_nearby(
+        begun, identities.thumbnail_of(np.clip(image.astype(int) + 5, 0, 255).astype(np.uint8))
     ).any()
-    assert state.changed_nearby(begun, state.thumbnail_of(np.roll(image, 1, axis=1))).all()
+    assert identities.changed_nearby(
+        begun, identities.thumbnail_of(np.roll(image, 1, axis=1))
+    ).all()
 
 
 def test_the_largest_numbers_of_every_row_are_those_that_sorting_finds() -> None:

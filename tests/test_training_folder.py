@@ -24,8 +24,8 @@ from vap_core.base.errors import BadOutput, VapError
 from vap_core.base.files import DATA, SHIPPED, sha256_of, writing
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.mini_pi0 import token_file
-from vap_core.policies.mini_pi0.token_file import Token
+from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0.learned_token import Token
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
 from vap_core.simulation.suites import suite
 from vap_make.films import demonstrations, scenes
@@ -218,7 +218,7 @@ def train_one(
 
     def learn(vlm: Path, folder: Path, *how: object) -> tuple[float, float]:
         embedding = np.zeros(short.width, np.float32)
-        token_file.save(folder, Token(how[-1][0], embedding, 0.5, load_vlm(vlm).sha256()))
+        learned_token.save(folder, Token(how[-1][0], embedding, 0.5, load_vlm(vlm).sha256()))
         return 0.5, 0.0
 
     monkeypatch.setattr(demonstrations, "EPISODES", 2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vap_core.base.types import Description
-from vap_core.perception.colours import COLOURS
+from vap_core.perception.describe import COLOURS
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object

@@ -15,9 +15,8 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 
 from tests.test_lerobot_plugin import PLUGIN, ROOT, site
 from vap_core.base.errors import BadAction, BadStudy, UnknownName
-from vap_core.policies.lerobot.config_twin import VapExpertConfig, VapSo101TwinConfig
 from vap_core.policies.lerobot.datasets import open_dataset
-from vap_core.policies.lerobot.twin import VapSo101Twin
+from vap_core.policies.lerobot.twin import VapExpertConfig, VapSo101Twin, VapSo101TwinConfig
 from vap_core.simulation import suites
 
 __all__ = ["site"]

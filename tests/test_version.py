@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from vap_core.base import version
+from vap_core.base import files
 
 
 def test_a_checkout_is_its_commit_and_whether_it_was_changed(tmp_path: Path) -> None:
@@ -20,10 +20,10 @@ def test_a_checkout_is_its_commit_and_whether_it_was_changed(tmp_path: Path) -> 
     git("add", ".")
     git("commit", "-qm", "first")
     commit = git("rev-parse", "--short=10", "HEAD")
-    assert version.code_version(tmp_path) == commit
+    assert files.code_version(tmp_path) == commit
     (tmp_path / "module.py").write_text("changed = True\n")
-    version.code_version.cache_clear()
-    assert version.code_version(tmp_path) == f"{commit}+"
+    files.code_version.cache_clear()
+    assert files.code_version(tmp_path) == f"{commit}+"
 
 
 def test_what_is_installed_inside_another_repository_is_not_its_commit(tmp_path: Path) -> None:
@@ -36,19 +36,19 @@ def test_what_is_installed_inside_another_repository_is_not_its_commit(tmp_path:
     installed = tmp_path / ".venv" / "vap_core"
     installed.mkdir(parents=True)
     (installed / "module.py").write_text("")
-    assert version.code_version(installed) == f"vap-core {version.version('vap-core')}"
+    assert files.code_version(installed) == f"vap-core {files.version('vap-core')}"
 
 
 def test_a_copy_is_the_installed_version_or_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    assert version.code_version(tmp_path) == f"vap-core {version.version('vap-core')}"
+    assert files.code_version(tmp_path) == f"vap-core {files.version('vap-core')}"
 
     def not_installed(name: str) -> str:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(version, "version", not_installed)
+    monkeypatch.setattr(files, "version", not_installed)
     copy = tmp_path / "copy"
     copy.mkdir()
-    assert version.code_version(copy) == "unknown"
+    assert files.code_version(copy) == "unknown"

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from tests.drawn import K, draw, ground, rig
-from vap_core.base.palette import LOOKALIKES, TARGET, rgb8
+from vap_core.base.pictures import (
+    LOOKALIKES,
+    TARGET,
+    result_line,
+    rgb8,
+    shown_candidates,
+    vote_picture,
+)
 from vap_core.base.types import election_scores
-from vap_core.base.vote_picture import result_line, shown_candidates, vote_picture
 from vap_core.vote import vote
 
 CAMERA = rig(0, 1)[0]

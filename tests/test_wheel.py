@@ -13,7 +13,7 @@ import cv2
 import pytest
 
 from tests.test_hub import serving
-from vap_core.perception.foundation import downloads, sources
+from vap_core.perception.foundation import sources, store
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
 
@@ -114,7 +114,7 @@ def run(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
                 "HOME": str(tmp_path),
                 "PATH": os.environ["PATH"],
                 "no_proxy": "127.0.0.1",
-                downloads.ENDPOINT_VARIABLE: os.environ[downloads.ENDPOINT_VARIABLE],
+                store.ENDPOINT_VARIABLE: os.environ[store.ENDPOINT_VARIABLE],
             },
             capture_output=True,
             text=True,

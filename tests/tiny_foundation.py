@@ -6,10 +6,9 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from vap_core.perception.foundation.architectures import quiet_transformers
-from vap_core.perception.foundation.downloads import pull
-from vap_core.perception.foundation.random_weights import letter_tokenizer
+from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
 from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source
+from vap_core.perception.foundation.store import pull
 
 KIND = "foundation"
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from vap_core.attend import Attender as Attender
     from vap_core.attend import Prompting as Prompting
     from vap_core.base.errors import VapError as VapError
-    from vap_core.base.photos import load_photo as load_photo
-    from vap_core.base.photos import photos_in as photos_in
+    from vap_core.base.media import load_photo as load_photo
+    from vap_core.base.media import photos_in as photos_in
     from vap_core.instruction import parse as parse
     from vap_core.instruction import rewrite as rewrite
     from vap_core.memory import load as load
@@ -58,7 +58,7 @@ _load, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
-        "base.photos": ["load_photo", "photos_in"],
+        "base.media": ["load_photo", "photos_in"],
         "study.diagnosis": ["diagnose"],
         "study.methods": ["METHODS"],
         "study.photos": ["measure_photos"],
@@ -91,7 +91,7 @@ if not TYPE_CHECKING:  # else every name would exist for type checkers
         try:
             return _load(name)
         except ModuleNotFoundError as error:
-            from vap_core.base.extras import missing_part
+            from vap_core.base.errors import missing_part
 
             part = missing_part(error)
             if part is None:

@@ -18,27 +18,14 @@ from unicodedata import normalize
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import (
-    BadEncoder,
-    BadMemory,
-    BadOutput,
-    BadPhoto,
-    UnknownName,
-    one_of,
-)
-from vap_core.base.files import (
-    encode_tensors,
-    parse_json,
-    read_file,
-    remove_scratch,
-    write_atomic,
-)
-from vap_core.base.photos import load_photo as load_photo
+from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto, UnknownName, one_of
+from vap_core.base.files import encode_tensors, parse_json, read_file, remove_scratch, write_atomic
+from vap_core.base.media import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
-from vap_core.instruction.owners import belonging, check_owner, owners_of
+from vap_core.instruction.context import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
+from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
-from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 FORMAT = "vap-personal-object"
 VERSION = 1

@@ -16,10 +16,16 @@ from vap_core.base.types import (
 )
 from vap_core.memory import reference_rows
 from vap_core.perception.boxes import box_cover
-from vap_core.perception.candidates import Candidates, Proposals
-from vap_core.perception.proof import MOST_COMPARED, prove
+from vap_core.perception.candidates import (
+    MOST_COMPARED,
+    Candidates,
+    Proposals,
+    describe_fault,
+    embed_crops,
+    prove,
+    row_fault,
+)
 from vap_core.perception.protocols import Stack
-from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 VoteRule = Literal["vote", "average", "best"]
 RULES: tuple[str, ...] = get_args(VoteRule)

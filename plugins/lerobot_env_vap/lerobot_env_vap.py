@@ -4,7 +4,6 @@
 `--robot.type=vap_so101_twin` and `--teleop.type=vap_expert`.
 """
 
-from vap_core.policies.lerobot import config_twin as config_twin
 from vap_core.policies.lerobot import step as step
 from vap_core.policies.mini_pi0 import configuration_mini_pi0 as configuration_mini_pi0
 from vap_core.policies.mini_pi0 import processor_mini_pi0 as processor_mini_pi0

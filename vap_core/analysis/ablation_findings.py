@@ -6,7 +6,7 @@ findings_table(ablation_results(episodes))
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from vap_core.base.tables import signed
+from vap_core.base.files import signed
 from vap_core.study.ablations import ArmResult, is_shown
 from vap_core.study.stats import Comparison, points_text
 

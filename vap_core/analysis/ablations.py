@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vap_core.base.figures import empty_figure
-from vap_core.base.palette import CASES
+from vap_core.base.pictures import CASES, empty_figure
 from vap_core.study.ablations import (
     CLEAR,
     PAPER,

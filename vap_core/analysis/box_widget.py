@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from vap_core.base.extras import require
+from vap_core.base.errors import require
 from vap_core.base.types import Rgb
 from vap_core.perception.references import Box
 

@@ -9,8 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.errors import one_of
-from vap_core.base.extras import require
+from vap_core.base.errors import one_of, require
 from vap_core.base.files import write_atomic
 from vap_core.simulation.suites import BENCHMARKS, WARM_UPS, suite
 from vap_core.study.stats import share

@@ -17,8 +17,7 @@ from tqdm import tqdm
 from vap_core import __version__
 from vap_core.attend import Attender, AttendState
 from vap_core.base.errors import BadDataset, BadOutput
-from vap_core.base.files import parse_json, write_atomic, writing
-from vap_core.base.tables import Rows, align
+from vap_core.base.files import Rows, align, parse_json, write_atomic, writing
 from vap_core.base.types import Attended, PersonalObject, value
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import checksums, load_own

@@ -14,12 +14,10 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import make_folder, write_atomic, writing
-from vap_core.base.tables import align
+from vap_core.base.files import align, make_folder, write_atomic, writing
 from vap_core.base.types import value
-from vap_core.policies.embedding_table import open_table
-from vap_core.policies.mini_pi0.teach_token import model_of_policy
-from vap_core.policies.token_groups import token_groups
+from vap_core.policies.mini_pi0.learned_token import model_of_policy
+from vap_core.policies.tables import open_table, token_groups
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study.paper import ledger
 

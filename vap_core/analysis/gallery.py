@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vap_core.analysis.plots import Tile
-from vap_core.base.figures import TIER_COLOURS
-from vap_core.base.parquet import read_parquet
+from vap_core.base.files import read_parquet
+from vap_core.base.pictures import TIER_COLOURS
 from vap_core.base.types import PersonalObject, Rgb
 from vap_core.perception.boxes import crop
 from vap_core.perception.protocols import Encoder
 from vap_core.policies.scripted.expert import Expert
-from vap_core.rollout.expert_loop import expert_steps
+from vap_core.rollout.running import expert_steps
 from vap_core.simulation.assets.objects import (
     OBJECTS,
     TIERS,

@@ -92,8 +92,8 @@ def ground_image(
         damaged or of another encoder.
     """
     from vap_core.memory import load_bank
+    from vap_core.perception.boxes import TiledDetector
     from vap_core.perception.stacks import load_own
-    from vap_core.perception.tiles import TiledDetector
 
     models = load_own(stack)
     if tiles and boxes is None:
@@ -123,8 +123,7 @@ def missing_threshold(stack: str) -> str:
 
     Raises: as `load_own`.
     """
-    from vap_core.perception.kept_thresholds import keep_command
-    from vap_core.perception.protocols import FamiliarityJudge
+    from vap_core.perception.protocols import FamiliarityJudge, keep_command
     from vap_core.perception.stacks import load_own
 
     models = load_own(stack)
@@ -161,7 +160,7 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
     An earlier answer is kept, and the new one gets a number. Raises: BadOutput.
     """
     from vap_core.analysis.plots import grounding_figure
-    from vap_core.base.figures import write_png
+    from vap_core.base.pictures import write_png
     from vap_core.recording import record_grounding
 
     first = found.attended.groundings[CAMERA][0]

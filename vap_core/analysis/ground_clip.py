@@ -8,10 +8,10 @@ from pathlib import Path
 
 from vap_core.analysis.ground import claimed_paths, shared_targets
 from vap_core.attend import Attender, AttendState, Prompting
-from vap_core.base import video
+from vap_core.base import media
 from vap_core.base.errors import BadPhoto
 from vap_core.base.files import file_fault
-from vap_core.base.photos import load_photo, photos_in
+from vap_core.base.media import load_photo, photos_in
 from vap_core.base.types import Attended, PersonalObject, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
@@ -64,7 +64,7 @@ def is_clip(path: Path) -> bool:
 
     What cannot be looked at is no folder.
     """
-    return os.path.isdir(path) or video.is_video(path)
+    return os.path.isdir(path) or media.is_video(path)
 
 
 def ground_clip(
@@ -127,7 +127,7 @@ def _follow(
     notes: tuple[str, ...] = ()
     with ExitStack() as files:
         recorder = files.enter_context(ClipRecorder(rrd, CAMERA, obj.name, hz))
-        film = files.enter_context(video.Mp4(mp4, hz))
+        film = files.enter_context(media.Mp4(mp4, hz))
         state: AttendState | None = None
         for number, rgb in enumerate(frames):
             at = number / hz
@@ -161,8 +161,8 @@ def _follow(
 def _open(path: Path) -> tuple[Iterator[Rgb], float]:
     """The frames of a video or of a folder, and how many there are a second. Raises: BadPhoto."""
     if not os.path.isdir(path):
-        hz = 1.0 if file_fault(path) else video.frame_rate(path)
-        return video.frames(path, SIDE), hz
+        hz = 1.0 if file_fault(path) else media.frame_rate(path)
+        return media.frames(path, SIDE), hz
     photos = photos_in(path)
     if not photos:
         raise BadPhoto(f"ground: {path} holds no picture; name a folder of frames.")

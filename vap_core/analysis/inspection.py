@@ -14,15 +14,14 @@ from vap_core.analysis.plots import candidates
 from vap_core.associate import PAIRINGS, Pairing, compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadOutput, UnknownName
-from vap_core.base.figures import GENERIC, OTHER, WINNER, empty_figure
-from vap_core.base.files import writing
-from vap_core.base.parquet import read_parquet
+from vap_core.base.files import read_parquet, writing
+from vap_core.base.pictures import GENERIC, OTHER, WINNER, empty_figure
 from vap_core.base.types import Grounding, Mask, PersonalObject
 from vap_core.perception.boxes import mask_box, mask_iou
 from vap_core.perception.protocols import Stack
 from vap_core.policies.scripted.expert import Expert
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import TintPrompter
 from vap_core.rollout.types import EpisodeHeader, Frame
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.analysis.plots import keep, small_jpeg
-from vap_core.base.files import write_atomic
-from vap_core.base.version import code_digest
+from vap_core.base.files import code_digest, write_atomic
 from vap_core.study.store import encode_table
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ SOURCES = ("simulation/assets", "simulation/studio.py", "perception/embedded", "
 def source_digest() -> str:
     """A digest of `SOURCES` and of the shipped weights."""
     import vap_core
-    from vap_core.perception.embedded.weights import FOLDER
+    from vap_core.perception.embedded.networks import FOLDER
 
     package = Path(vap_core.__file__).parent
     found = hashlib.sha256((FOLDER / "manifest.json").read_bytes())

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from vap_core.analysis.notebook_links import notebook_files, notebook_title, read_notebook
-from vap_core.base.extras import require
+from vap_core.base.errors import require
 from vap_core.base.files import write_atomic, writing
 
 if TYPE_CHECKING:

@@ -9,21 +9,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.figures import BAR_COLOURS, LINE_COLOURS, TIER_COLOURS, empty_figure
 from vap_core.base.files import write_atomic
-from vap_core.base.palette import (
+from vap_core.base.pictures import (
+    BAR_COLOURS,
     ELECTED,
     ELECTED_CASING,
     FRAME,
     GRID,
+    LINE_COLOURS,
     METHODS,
     ROLES,
     SUITES,
     TEXT,
     THIN_LINES,
+    TIER_COLOURS,
+    empty_figure,
+    vote_picture,
 )
 from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, value
-from vap_core.base.vote_picture import vote_picture
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study.stats import Rate
 

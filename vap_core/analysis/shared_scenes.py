@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.figures import empty_figure
-from vap_core.base.palette import FRAME, GRID, METHODS, TEXT
-from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
+from vap_core.base.pictures import FRAME, GRID, METHODS, TEXT, empty_figure
+from vap_core.policies.protocol import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.simulation.suites.simpler import FILMED_AREA

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.figures import OTHER, WINNER, empty_figure
-from vap_core.base.palette import FRAME, GRID
+from vap_core.base.pictures import FRAME, GRID, OTHER, WINNER, empty_figure
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,6 +1,14 @@
 """Errors with their remedy: one line that says where, what was possible and what to do next."""
 
-from collections.abc import Iterable
+import os
+import resource
+import shlex
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
 
 
 def first_line(error: BaseException | str) -> str:
@@ -142,3 +150,138 @@ def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
     """
     names = ", ".join(sorted(map(str, known)))
     return UnknownName(f"{what} {name!r} is unknown; known: {names}.")
+
+
+EXTRAS = {
+    "policy": ("torch", "torchvision", "lerobot", "transformers", "datasets"),
+    "foundation": ("torch", "torchvision", "transformers", "timm"),
+    "notebooks": ("rerun_notebook", "jupyter_bbox_widget", "ipykernel"),
+    "ray": ("ray",),
+    "export": ("torch", "onnx"),
+}
+
+
+def require(extra: str, what: str) -> None:
+    """`what` needs an extra. Raises: MissingPart: a module of it is not installed."""
+    for module in EXTRAS[extra]:
+        if find_spec(module) is None:
+            raise MissingPart(_message(what, module, extra))
+
+
+def missing_part(error: ModuleNotFoundError) -> MissingPart | None:
+    """The error for an import that failed, if an extra brings that module."""
+    module = (error.name or "").partition(".")[0]
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            return MissingPart(_message("this", module, extra))
+    return None
+
+
+def _message(what: str, module: str, extra: str) -> str:
+    return f"{what} needs {module}, which is not installed; run: pip install 'vap-core[{extra}]'"
+
+
+VARIABLE = "VAP_DEVICE"
+"""Environment variable that names the device of foundation models and policies: cpu, cuda:1, ..."""
+
+
+def device_name(device: str | None = None) -> str:
+    """The argument, else `VAP_DEVICE`, else a GPU where there is one.
+
+    Raises: UnknownName: no such device on this machine.
+    """
+    require("policy", "a choice of device")
+    import torch
+
+    name = device or os.environ.get(VARIABLE)
+    if not name:
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(0, device=torch.device(name))
+    except (RuntimeError, AssertionError) as error:
+        raise UnknownName(
+            f"device {name!r} is not on this machine ({str(error).splitlines()[0]}); "
+            f"unset {VARIABLE}, or use cpu."
+        ) from error
+    return name
+
+
+def check_device() -> None:
+    """What `VAP_DEVICE` names is on this machine, whether or not the models at hand use it.
+
+    Raises: UnknownName.
+    """
+    if os.environ.get(VARIABLE, "cpu") not in ("", "cpu"):
+        device_name()
+
+
+LARGEST_SEED = 2**32
+"""Seeds are smaller: a date is one."""
+PAGES = Path("/proc/self/statm")
+"""Linux counts this process's pages here, the address space first."""
+AGAIN_S = 1.0
+"""Libraries that catch every exception are interrupted again after so much CPU time."""
+
+
+class _TimeIsUp(BaseException):
+    """Raised inside the work. No `except Exception` of a library's catches it."""
+
+
+@contextmanager
+def bounded(memory_bytes: int, cpu_s: float) -> Iterator[None]:
+    """The block may take so much more memory, and so much CPU time.
+
+    Memory is limited on Linux. Time is limited in the main thread, where signal handlers run; a
+    call into C that does not return is not interrupted.
+
+    Raises: MemoryError; TimeoutError.
+    """
+    try:
+        with _memory_limit(memory_bytes), _timer(cpu_s):
+            yield
+    except _TimeIsUp:
+        raise TimeoutError(f"over {cpu_s:g} s of CPU time") from None
+
+
+@contextmanager
+def _memory_limit(more_bytes: int) -> Iterator[None]:
+    if not PAGES.exists():
+        yield
+        return
+    taken = int(PAGES.read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = taken + more_bytes
+    if soft != resource.RLIM_INFINITY:
+        limit = min(limit, soft)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@contextmanager
+def _timer(cpu_s: float) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise _TimeIsUp
+
+    former = signal.signal(signal.SIGPROF, interrupt)
+    signal.setitimer(signal.ITIMER_PROF, cpu_s, AGAIN_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, former)
+
+
+def command(*words: str | Path, environment: Mapping[str, str] | None = None) -> str:
+    """A command of the package as a line for the shell: every word and variable is quoted."""
+    parts = []
+    for name, setting in (environment or {}).items():
+        parts.append(f"{name}={shlex.quote(setting)}")
+    parts.append(shlex.join(["python", "-m", "vap_core", *map(str, words)]))
+    return " ".join(parts)

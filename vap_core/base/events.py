@@ -3,7 +3,7 @@ were lost and found."""
 
 from collections.abc import Mapping
 
-from vap_core.base.tables import signed
+from vap_core.base.files import signed
 from vap_core.base.types import Association, Ballot, Event, Grounding
 
 Visible = frozenset[tuple[str, int]]

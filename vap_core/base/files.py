@@ -1,25 +1,38 @@
-"""Files that are complete or absent, and where the files that ship with the package are."""
+"""Files that are complete or absent, tables and checks of their values, and the version of the code
+that wrote them.
+"""
 
+import ast
+import csv
 import errno
 import fcntl
 import hashlib
+import inspect
+import io
 import json
 import os
 import shutil
 import stat
 import struct
+import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from vap_core.base.errors import BadOutput, first_line
+from vap_core.base.errors import BadOutput, BadStudy, VapError, first_line
 
 if TYPE_CHECKING:
     import numpy as np
+    import pandas as pd
+    import pyarrow as pa
+    from datafusion import SessionContext
+
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _INSTALLED = _PACKAGE / "data"
@@ -243,3 +256,279 @@ def sha256_of(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_rows(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    """Write rows, the columns' names first; a cell with a comma or a quote is quoted.
+
+    Raises: OSError.
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_atomic(path, text.getvalue().encode())
+
+
+def read_rows(
+    path: Path,
+    columns: Sequence[str],
+    *,
+    optional: Sequence[str] = (),
+    caller: str,
+    error: type[VapError],
+) -> list[tuple[int, dict[str, str]]]:
+    """Every row that is not empty, with the number of its line; a cell that is absent is "".
+
+    `caller` is the command that an error names.
+
+    Raises: `error`, for a file that cannot be read, or that lacks one of `columns`.
+    """
+    names = (*columns, *optional)
+    try:
+        check_regular(path)
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            for name in columns:
+                if name not in (reader.fieldnames or ()):
+                    raise error(
+                        f"{caller}: {path} lacks the column {name!r}; its first line is "
+                        f"{','.join(names)}."
+                    )
+            rows = []
+            for row in reader:
+                cells = {name: (row.get(name) or "").strip() for name in names}
+                if any(cells.values()):
+                    rows.append((reader.line_num, cells))
+            return rows
+    except (OSError, UnicodeDecodeError, csv.Error) as failure:
+        raise error(
+            f"{caller}: {path} cannot be read ({failure!s:.100}); save it as UTF-8 with commas."
+        ) from failure
+
+
+UNOPENED = (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM)
+"""Errors of opening or reading a file that say nothing of what it holds."""
+
+
+def read_arrow(path: Path, caller: str, remedy: str) -> "pa.Table":
+    """A table with its notes.
+
+    Raises: BadOutput, of one line. It ends with the `remedy`, unless the table only cannot be
+        opened: then nothing says that it is damaged.
+    """
+    from pyarrow import ArrowException
+    from pyarrow.parquet import read_table
+
+    try:
+        check_regular(path)
+        return read_table(path)
+    except (UnicodeEncodeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in UNOPENED:
+            raise BadOutput(f"{caller}: {path} is damaged; {remedy}.") from error
+        reason = getattr(error, "strerror", None) or "a name that is no text"
+        raise BadOutput(
+            f"{caller}: {ascii(str(path))[1:-1]} cannot be opened ({reason}); the table may be "
+            "whole: mend that, and run the same command again."
+        ) from error
+    except (ArrowException, ValueError) as error:
+        raise BadOutput(f"{caller}: {path} is damaged; {remedy}.") from error
+
+
+def read_parquet(path: Path, caller: str, remedy: str) -> "pd.DataFrame":
+    """The rows of a table. Raises: BadOutput, of one line that ends with the `remedy`."""
+    return read_arrow(path, caller, remedy).to_pandas()
+
+
+Rows = Sequence[Sequence[str]]
+"""The header first; every row has as many cells."""
+
+
+def align(rows: Rows) -> str:
+    """Plain text with aligned columns."""
+    return _render(rows, "simple")
+
+
+def markdown(rows: Rows) -> str:
+    """A pipe table that is aligned as plain text, too."""
+    safe = []
+    for row in rows:
+        safe.append([cell.replace("|", "\\|") for cell in row])
+    return _render(safe, "github")
+
+
+def signed(value: float, digits: int = 0) -> str:
+    """A rounded number with its sign: "+3", "-0.4"; "+0" for all that rounds to zero."""
+    return f"{value:+z.{digits}f}"
+
+
+def signed_interval(middle: float, low: float, high: float, digits: int = 0) -> str:
+    """A signed number and its interval: "+3 [-1, +7]"."""
+    return f"{signed(middle, digits)} [{signed(low, digits)}, {signed(high, digits)}]"
+
+
+def _render(rows: Rows, style: str) -> str:
+    from tabulate import tabulate
+
+    text = tabulate(rows[1:], headers=rows[0], tablefmt=style, disable_numparse=True)
+    return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+LONGEST, DEEPEST = 4_000, 40
+"""Characters and nested brackets of a condition. The parser recurses: far more end the process."""
+FUNCTIONS = frozenset(
+    "abs ceil char_length character_length coalesce contains ends_with exp floor greatest isnan "
+    "least left length ln log10 lower nullif power regexp_like right round signum sqrt "
+    "starts_with strpos substr substring trim btrim trunc upper".split()
+)
+"""What a condition may call. Others can make a value of any length, and exhaust the memory."""
+LINE = "__vap_line__"
+"""The column with a row's number; no table of ours has one of this name."""
+
+
+def rows_matching(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
+    """The rows for which a SQL condition holds, such as "margin < 0.05 and success = false".
+
+    Raises: BadStudy.
+    """
+    flat = table.reset_index(drop=True)
+    with _asked({"episodes": flat.assign(**{LINE: flat.index})}, condition) as context:
+        lines: list[int] = []
+        for batch in context.table("episodes").filter(condition).select(LINE).collect():
+            lines += batch[LINE].to_pylist()
+    return flat.loc[sorted(lines)]
+
+
+def select(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "pd.DataFrame":
+    """What a SQL query over tables finds; it can change nothing. Raises: BadStudy."""
+    from datafusion import SQLOptions
+
+    options = SQLOptions().with_allow_ddl(False).with_allow_dml(False).with_allow_statements(False)
+    with _asked(tables, sql) as context:
+        return context.sql_with_options(sql, options).to_pandas()
+
+
+@contextmanager
+def _asked(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "Iterator[SessionContext]":
+    """A session with some tables; what is wrong with a question to them is one line."""
+    import pyarrow as pa
+
+    _check_size(sql)
+    context = _small_context()
+    for name, table in tables.items():
+        arrow = pa.Table.from_pandas(table, preserve_index=False)
+        # A table without rows has no batch, and datafusion panics at none.
+        batches = arrow.to_batches() or [pa.RecordBatch.from_pylist([], schema=arrow.schema)]
+        context.register_record_batches(name, [batches])
+    try:
+        yield context
+    except Exception as error:  # datafusion raises bare exceptions
+        reason = " ".join(str(error).split())[:200]
+        columns = "; of ".join(
+            f"{name} its columns are {', '.join(str(c) for c in table.columns if c != LINE)}"
+            for name, table in tables.items()
+        )
+        raise BadStudy(
+            f"condition: {sql[:200]!r} is none on this table ({reason}); {columns}."
+        ) from error
+
+
+def _check_size(condition: str) -> None:
+    depth = deepest = 0
+    for character in condition:
+        depth += (character == "(") - (character == ")")
+        deepest = max(deepest, depth)
+    if len(condition) > LONGEST or deepest > DEEPEST:
+        raise BadStudy(
+            f"condition: it has {len(condition):,} characters and {deepest} nested brackets; "
+            f"{LONGEST:,} and {DEEPEST} are the most."
+        )
+
+
+def _small_context() -> "SessionContext":
+    """A session that knows FUNCTIONS alone."""
+    from datafusion import SessionContext
+
+    context = SessionContext()
+    for name in context.udfs():
+        if name not in FUNCTIONS:
+            context.deregister_udf(name)
+    return context
+
+
+@cache
+def code_version(folder: Path | None = None) -> str:
+    """The commit of a checkout (default: this one), with `+` when the tree differs.
+
+    Where there is none, the installed version; "unknown" for a copy that is neither.
+    """
+    folder = folder or Path(__file__).resolve().parent
+    try:
+        if not _git(folder, "ls-files"):  # installed inside another project's repository
+            return _installed_version()
+        return _git(folder, "describe", "--always", "--dirty=+", "--abbrev=10")
+    except (OSError, subprocess.SubprocessError):
+        return _installed_version()
+
+
+def _git(folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()
+
+
+def code_digest(folder: Path, without: Collection[str] = ()) -> str:
+    """A digest of a module, or of those below a folder but for the ones named in `without`.
+
+    Comments, docstrings and line breaks do not count.
+    """
+    found = hashlib.sha256()
+    paths = [folder] if folder.is_file() else sorted(folder.rglob("*.py"))
+    for path in paths:
+        if path.stem in without:
+            continue
+        found.update(path.relative_to(folder).as_posix().encode())
+        found.update(ast.dump(_without_docstrings(ast.parse(path.read_text()))).encode())
+    return found.hexdigest()[:16]
+
+
+def source_digest(form: Any) -> str:
+    """A digest of the source of a function, or of the class of a callable and of its bases.
+
+    What has no source, because it is built in or typed into a console, is left out; "" where
+    nothing has any.
+    """
+    if inspect.isroutine(form) or inspect.isclass(form):
+        parts: tuple[Any, ...] = (form,)
+    else:
+        parts = type(form).__mro__
+    source = ""
+    for part in parts:
+        try:
+            source += inspect.getsource(part)
+        except (OSError, TypeError):
+            continue
+    return hashlib.sha256(source.encode()).hexdigest()[:16] if source else ""
+
+
+def _installed_version() -> str:
+    try:
+        return f"vap-core {version('vap-core')}"
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if not isinstance(body, list):
+            continue
+        node.body = [part for part in body if not _is_string(part)]  # type: ignore[attr-defined]
+    return tree
+
+
+def _is_string(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )

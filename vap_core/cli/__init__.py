@@ -10,8 +10,7 @@ import sys
 
 import typer
 
-from vap_core.base.errors import VapError
-from vap_core.base.extras import missing_part
+from vap_core.base.errors import VapError, missing_part
 from vap_core.cli import bench, look, machine, measure, own, run
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vap_core.base.commands import command
+from vap_core.base.errors import command
 from vap_core.cli.command import StackName
 from vap_core.cli.timing import Parts
 
@@ -74,7 +74,7 @@ def table(arms: Sequence[Arm], clock: str = "cpu") -> str:
     """Every arm: milliseconds, times the first of its axis with a 95 % interval, its parts."""
     import numpy as np
 
-    from vap_core.base.tables import align
+    from vap_core.base.files import align
     from vap_core.study.stats import ratio
 
     parts = list(dict.fromkeys(part for arm in arms for part in arm.costs[0].get("parts", ())))
@@ -137,7 +137,7 @@ PARTS = {
     ),
     "checksum": (f"{LEROBOT}sha256",),
 }
-PROMPTER = "vap_core.rollout.prompters.tint:TintPrompter."
+PROMPTER = "vap_core.rollout.prompters:TintPrompter."
 ROLLOUT_PARTS = {
     "environment": (
         *(f"{ENV}{name}" for name in ("__init__", "reset", "observe", "state", "step", "truth")),
@@ -189,7 +189,7 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     from vap_core.perception.embedded.backbone import features
     from vap_core.recording import DeferredRecorder
     from vap_core.rollout.loop import rollout
-    from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.rollout.prompters import TintPrompter
     from vap_core.study import diagnosis, steps, store
     from vap_core.study.trials import DEMO, make_trial, register_personal
 
@@ -277,7 +277,7 @@ TASKS = {
 
 def profile(folder: Path, quick: bool) -> list[Arm]:
     """A control step of eval by part: every suite and two methods with the shipped policies."""
-    from vap_core.policies.names import MINI
+    from vap_core.policies.protocol import MINI
     from vap_core.study.engine import run_job, spread_evenly
     from vap_core.study.trials import Study, register_personal
 
@@ -348,9 +348,9 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
-    from vap_core.policies.names import MINI
+    from vap_core.policies.protocol import MINI
     from vap_core.rollout.loop import Trial, rollout
-    from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.env import Env
     from vap_core.simulation.suites.open_row import build_scene
@@ -510,7 +510,7 @@ class LoopProcess:
 
     def __init__(self, checkout: Path, plan: Plan, folder: Path) -> None:
         from vap_core.base.errors import BadStudy
-        from vap_core.base.version import code_version
+        from vap_core.base.files import code_version
 
         package = checkout.resolve() / "vap_core" / "__init__.py"
         if not package.is_file():
@@ -574,13 +574,13 @@ def evaluate(folder: Path, quick: bool, earlier: Path | None, ended: ExitStack) 
     """
     import vap_core
     from vap_core.attend import Attender
-    from vap_core.base.version import code_version
+    from vap_core.base.files import code_version
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, toy_sizes
     from vap_core.rollout.loop import Trial, rollout
-    from vap_core.rollout.prompters.tint import TintPrompter
+    from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.suites.open_row import build_scene, models_of
 
@@ -663,7 +663,7 @@ def provenance(**about: Any) -> dict[str, Any]:
     from datetime import UTC, datetime
     from importlib.metadata import PackageNotFoundError, version
 
-    from vap_core.base.version import code_version
+    from vap_core.base.files import code_version
 
     libraries = {"python": platform.python_version()}
     for name in ("torch", "mujoco", "lerobot", "onnxruntime", "ray"):
@@ -774,7 +774,7 @@ def commands() -> dict[str, list[str]]:
 
 def size() -> str:
     """How much there is to read: counts of vap_core and vap_make by folder, options, commands."""
-    from vap_core.base.tables import align
+    from vap_core.base.files import align
 
     root = Path(__file__).resolve().parents[2]
     found = count([root / name for name in ("vap_core", "vap_make") if (root / name).is_dir()])

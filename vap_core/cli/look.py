@@ -153,7 +153,7 @@ def query(
     Example: python -m vap_core query data/runs/demo
         "select method, camera, avg(track_score) from steps group by method, camera"
     """
-    from vap_core.base.tables import align
+    from vap_core.base.files import align
     from vap_core.study import steps
 
     if question is None:
@@ -245,8 +245,7 @@ def _combined(one: Path, other: Path) -> Path:
 
 def _check(recording: Path) -> None:
     """Check that a recording can be read. Raises: BadRecording; of a leftover it names the mend."""
-    from vap_core.base.commands import command
-    from vap_core.base.errors import BadRecording
+    from vap_core.base.errors import BadRecording, command
     from vap_core.recording import read_summary
     from vap_core.recording.stream import LEFTOVER
 

@@ -13,8 +13,7 @@ from typing import Annotated
 
 import typer
 
-from vap_core.base.errors import VapError
-from vap_core.base.extras import require
+from vap_core.base.errors import VapError, require
 from vap_core.cli.command import RandomSeed
 
 app = typer.Typer()
@@ -130,7 +129,7 @@ def _torch() -> tuple[str, str]:
 
 
 def _weights() -> tuple[str, str]:
-    from vap_core.perception.embedded.weights import read_manifest, weights_sha256
+    from vap_core.perception.embedded.networks import read_manifest, weights_sha256
     from vap_core.perception.stacks import load_embedded
 
     load_embedded()
@@ -234,7 +233,7 @@ def _not_in_view() -> Finding:
     """Whether every foundation stack can say that an object is not in view."""
     from vap_core.perception.foundation.sources import KINDS
     from vap_core.perception.foundation.store import store_folder
-    from vap_core.perception.kept_thresholds import keep_command, thresholds_file
+    from vap_core.perception.protocols import keep_command, thresholds_file
     from vap_core.perception.stacks import EMBEDDED_THRESHOLDS
 
     lacking = [kind for kind in KINDS if not thresholds_file(store_folder(), kind).is_file()]
@@ -286,9 +285,8 @@ def pull_weights(
     Example: python -m vap_core weights pull --stack foundation-small
     Example: python -m vap_core weights pull --stack foundation:detector=llmdet-tiny --unpinned
     """
-    from vap_core.perception.foundation.downloads import pull
     from vap_core.perception.foundation.sources import models_of
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.store import pull, store_folder
 
     pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)
 
@@ -306,7 +304,7 @@ def export_weights(
     Example: python -m vap_core weights export --folder data/runs/weights
     """
     from vap_core.base.files import writing
-    from vap_core.perception.embedded.export import export_graphs
+    from vap_make.perception.graphs import export_graphs
 
     with writing(folder, "weights export"):
         paths = export_graphs(folder)
@@ -411,7 +409,7 @@ def vlm(
 
     Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
-    from vap_core.base.commands import command
+    from vap_core.base.errors import command
     from vap_make.films.scenes import CACHE
     from vap_make.vlm.train import Recipe, train
 
@@ -510,8 +508,7 @@ def policy(
     """
     from dataclasses import replace
 
-    from vap_core.base.commands import command
-    from vap_core.base.errors import BadStudy, one_of
+    from vap_core.base.errors import BadStudy, command, one_of
     from vap_make.recipe import RECIPES
 
     if suite not in RECIPES:

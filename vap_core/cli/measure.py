@@ -484,7 +484,7 @@ def attention(
     """
     from vap_core.analysis.attention import examples, replay, report
     from vap_core.analysis.attention.tables import publish as publish_tables
-    from vap_core.base.commands import command
+    from vap_core.base.errors import command
 
     if out is None:
         table = run.suffix == ".parquet"

@@ -95,8 +95,8 @@ def register(
     import os.path
     from contextlib import suppress
 
-    from vap_core.base.commands import command
-    from vap_core.instruction.owners import check_owner
+    from vap_core.base.errors import command
+    from vap_core.instruction.context import check_owner
     from vap_core.memory import check_names, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
     from vap_core.perception.stacks import load_stack
@@ -206,11 +206,10 @@ def ground(
         write_evidence,
     )
     from vap_core.analysis.ground_clip import ground_clip, is_clip
-    from vap_core.base.commands import command
-    from vap_core.base.errors import BadInstruction
-    from vap_core.base.photos import load_photo, shrink
+    from vap_core.base.errors import BadInstruction, command
+    from vap_core.base.media import load_photo, shrink
     from vap_core.instruction.parsers import Parsing
-    from vap_core.perception.tiles import SMALL_MEGAPIXELS
+    from vap_core.perception.boxes import SMALL_MEGAPIXELS
 
     parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
     if is_clip(image):
@@ -279,7 +278,7 @@ def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
     from datetime import datetime
 
     from vap_core.base.errors import BadOutput
-    from vap_core.instruction.history import add_uses
+    from vap_core.instruction.context import add_uses
 
     try:
         add_uses(memory, objects, speaker, datetime.now().astimezone())
@@ -341,7 +340,7 @@ def import_object(
 
     Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
     """
-    from vap_core.base.commands import command
+    from vap_core.base.errors import command
     from vap_core.simulation.assets.objects import extent_m, load_scanned_object
     from vap_core.simulation.assets.scans import import_scan, storage
     from vap_core.simulation.grasps import too_wide_for
@@ -402,7 +401,7 @@ def designs(
 
     Example: python -m vap_core objects designs data/designs --seed 1
     """
-    from vap_core.base.commands import command
+    from vap_core.base.errors import command
     from vap_core.simulation.assets.scans.designs import TABLE, write_designs
 
     paths = write_designs(out, count, seed)
@@ -431,7 +430,7 @@ def photograph(
 
     Example: python -m vap_core objects photograph camera-personal --out data/photos/camera
     """
-    from vap_core.base.commands import command
+    from vap_core.base.errors import command
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.studio import write_views
 
@@ -467,7 +466,7 @@ def attach_command(
     Example: python -m vap_core attach data/policies/mini-pi0-simpler-bridge-wide-seed-0
         data/runs/mine --memory data/runs/bridge/memory
     """
-    from vap_core.base.extras import require
+    from vap_core.base.errors import require
 
     require("policy", "attach")
     from vap_core.policies.lerobot.step import attach
@@ -543,12 +542,11 @@ def inspect_dataset_command(
     Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup" --episodes 3
         --copy ~/datasets/desk-vap
     """
-    from vap_core.base.extras import require
+    from vap_core.base.errors import require
 
     require("policy", "inspect-dataset")
     from vap_core.analysis.dataset_inspection import TABLE, inspect_dataset, report_table
-    from vap_core.base.commands import command
-    from vap_core.base.errors import BadDataset
+    from vap_core.base.errors import BadDataset, command
 
     if masks and copy is None:
         raise BadDataset("inspect-dataset: --masks go into a copy; name its folder with --copy.")

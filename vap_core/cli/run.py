@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from vap_core.base.limits import LARGEST_SEED
+from vap_core.base.errors import LARGEST_SEED
 from vap_core.cli.command import RunFolder, StackName, Workers, names, takes
 
 if TYPE_CHECKING:
@@ -292,7 +292,7 @@ def ablate(
     Example: python -m vap_core ablate rewrite --suite simpler-fractal --split "visual matching"
     """
     from vap_core.base.errors import BadStudy, one_of
-    from vap_core.base.tables import align
+    from vap_core.base.files import align
     from vap_core.study.methods import ABLATIONS
 
     if name is None:
@@ -331,7 +331,7 @@ def run_suites(asked: AskedOfAll) -> None:
     What can be checked before anything large is imported is checked first.
     """
     from vap_core.base.errors import BadStudy, BadSuite
-    from vap_core.policies.names import check_policy_name
+    from vap_core.policies.protocol import check_policy_name
 
     if asked.record is not None:
         record_of(asked.record)
@@ -366,7 +366,7 @@ def study_of(asked: AskedOfAll) -> "Study":
         BadSuite; else as `Study`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.policies.names import PRIVILEGED
+    from vap_core.policies.protocol import PRIVILEGED
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.suites import BENCHMARKS, open_file, tasks_of
     from vap_core.study.trials import Study, default_policy
@@ -428,8 +428,8 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
         BadCluster when there is none at the address; BadOutput, WorkerDied, as `engine.run`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.policies.names import PRIVILEGED
-    from vap_core.rollout.queries import named_queries
+    from vap_core.policies.protocol import PRIVILEGED
+    from vap_core.rollout.calls import named_queries
     from vap_core.study.cluster import ray_executor
     from vap_core.study.engine import run
     from vap_core.study.processes import results

@@ -13,7 +13,7 @@ import numpy as np
 from vap_core.base.errors import UnknownName
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.rollout.loop import Trial
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.suites.open_row import build_scene, models_of, open_row
 from vap_core.simulation.types import EpisodeRow

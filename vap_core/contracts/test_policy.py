@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from vap_core.contracts.given import short_rows, trial_of
+from vap_core.rollout.calls import check_policy
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.policy_call import check_policy
 from vap_core.rollout.types import Episode
 
 STEPS = 6

@@ -6,7 +6,7 @@ import numpy as np
 
 from vap_core.base.types import Attended, Views
 from vap_core.contracts.given import short_rows
-from vap_core.rollout.prompters.protocol import PromptContext, Prompter, SceneTruth
+from vap_core.rollout.prompters import PromptContext, Prompter, SceneTruth
 from vap_core.simulation.env import Env
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import Observation

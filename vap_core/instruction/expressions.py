@@ -1,15 +1,17 @@
-"""Expressions that may refer to an object, by grammar: where they begin and end, and what they say.
+"""Expressions that may refer to an object, by grammar: where they are, whose they are, and
+the steps of a sentence.
 
-Nothing here knows what objects look like or are for: `embedding` decides which object is meant.
+Nothing here knows what objects look like or are for: `implicit` decides which object is meant.
 """
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 
+from vap_core.base.errors import BadInstruction
 from vap_core.base.types import value
-from vap_core.instruction.context import Context
-from vap_core.instruction.owners import MINE
+from vap_core.instruction.context import MINE, OTHERS, Context, fold
 from vap_core.instruction.rule import ARTICLE, category_pattern, possessive, pronoun, spaced
 
 PLACING = "put|place|set|lay|move|drop|push|stack|store|leave|slide|stand|stow"
@@ -315,3 +317,133 @@ def _trim(text: str, start: int, stop: int) -> int:
         stop = start + len(shorter)
         if shorter == text[start:stop] and shorter == said:
             return stop
+
+
+@dataclass(frozen=True)
+class Possession:
+    """Who owns, or did, what the expressions of one instruction say."""
+
+    context: Context
+    text: str
+    expressions: Sequence[Expression]
+
+    def owner(self, expression: Expression, said: str) -> str | None:
+        """The owner that an expression names; `said` is it without what it excludes."""
+        person = person_pattern(self.context)
+        categories = {obj.category for obj in self.context.objects.values()}
+        # "it's Ben's" and "the cup's Ben's", but not the two of "Anna's brother's"
+        subjects = ["it", "that", "this", "which", "who", "one", *map(spaced, categories)]
+        for pattern in (
+            rf"\bof (mine|his|hers|theirs|ours|(?:{person})|[\w-]+['’]s)(?:['’]s)?(?:\W|$)",
+            rf"\b(?:belong\w*|owned) (?:to|by) (my [\w-]+|{person}|us|him|her|them|[\w-]+)\b",
+            rf"\b({person}|my [\w-]+|he|she|they|we|[A-Z][\w-]+) (?:owns?\b|has\W*$)",
+            r"(?:\bis|\bare|['’]s) (mine|his|hers|theirs|ours|my [\w-]+['’]s)(?:\W|$)",
+            rf"(?:\bis|\bare|\b(?:{'|'.join(subjects)})['’]s) ([\w-]+['’]s)(?:\W|$)",
+        ):
+            match = re.search(pattern, said, re.IGNORECASE)
+            if match:
+                return self.antecedent(expression, match.group(1))
+        if expression.kind == "several":
+            return said.split()[2]
+        if expression.kind in ("owner", "alone"):
+            beginning = self._beginning(said)
+            return beginning and self.antecedent(expression, beginning)
+        if find_category(said, categories) is not None:
+            for other in self.expressions:
+                if other.kind == "alone" and other is not expression:
+                    return fold(other.said)
+        return None
+
+    def elsewhere(self, expression: Expression) -> str | None:
+        """The only owner that another expression names: "Ben's cup is there: take that one"."""
+        owners = set()
+        for other in self.expressions:
+            if other.kind in ("owner", "alone") and other is not expression:
+                beginning = self._beginning(other.said)
+                if beginning:
+                    owners.add(fold(beginning))
+        return owners.pop() if len(owners) == 1 else None
+
+    def _beginning(self, said: str) -> str | None:
+        """The owner that an expression begins with: "my", "Anna's", "James'"."""
+        people = person_pattern(self.context)
+        known = possessive(people)
+        things = "|".join({spaced(obj.category) for obj in self.context.objects.values()})
+        one = rf"(?!(?:{things})['’])[\w-]+['’]s"  # no person: "my brother's cup's lid"
+        pattern = (
+            rf"{pronoun(people)}(?:\s+(?:[\w-]+\s+)?{one}(?:\s+{one})?)?(?=\W|$)"
+            rf"|mine|hers|theirs|ours|(?:{known}|[\w-]+['’]s)(?:\s+{one}){{0,2}}"
+        )
+        match = re.match(pattern, said, re.IGNORECASE)
+        return match and match.group()
+
+    def antecedent(self, expression: Expression, owner: str) -> str:
+        """The person that "his" refers to, where one is named before; else the words themselves."""
+        if fold(owner) not in OTHERS:
+            return owner
+        people = re.compile(rf"\b(?:{person_pattern(self.context)})\b", re.IGNORECASE)
+        named = []
+        for match in people.finditer(self.text[: expression.start]):
+            if fold(match.group()) not in MINE:
+                named.append(match.group())
+        return named[-1] if named else owner
+
+
+_NEXT = r"(?:and\s+)?(?:then|after that|afterwards)\b"
+STEP = re.compile(
+    rf"\s*(?:[,;.!?]+\s*{_NEXT}|\s{_NEXT}"
+    r"|(?:[;!?]+|(?<!\bDr)(?<!\bMr)(?<!\bMrs)(?<!\bMs)(?<!\bSt)\.)(?=\s+\S)"
+    r"|[\r\n]+)\s*,?\s*",
+    re.IGNORECASE,
+)
+"""What stands between two steps: "then", "and then", "after that", the end of a sentence, of which
+"!" and "?" are one, too, or of a line."""
+_NOTHING = re.compile(rf"(?:and|{_NEXT})?\W*", re.IGNORECASE)
+"""What is no command: "then" or "and" alone, or no word at all."""
+_BEFORE = r"(?:(?:first|now|please|(?:could|can|would|will) you)\s*,?\s+)*"
+STEP_VERB = re.compile(rf"{_BEFORE}(?P<verb>{ACTION})\b", re.IGNORECASE)
+PLACE = re.compile(rf"{_BEFORE}(?:{PLACING})\b", re.IGNORECASE)
+STEP_DESTINATION = re.compile(
+    r"\s(?:into|onto|in|on|near|next to|beside|to|at|inside|under)\s.*", re.IGNORECASE
+)
+IT = re.compile(r"\b(?:it|them)\b", re.IGNORECASE)
+
+
+def decompose(text: str) -> tuple[str, ...]:
+    """The commands of an instruction, in order: one for each step, at least one.
+
+    A step without a verb repeats the one before it, and where that places something, its place,
+    unless it names one of its own.
+
+    Raises: BadInstruction: no step, or "it" in a later step, which could be several objects.
+    """
+    steps: list[str] = []
+    for part in STEP.split(text.strip().rstrip(".!?")):
+        step = " ".join(part.split())
+        if _NOTHING.fullmatch(step):
+            continue
+        if steps and IT.search(step):
+            raise BadInstruction(
+                f"decompose: 'it' in {step!r} could be any object of {steps[-1]!r} or before; name "
+                "the object."
+            )
+        if steps and not STEP_VERB.match(step):
+            step = _completed(step, steps[-1])
+        steps.append(step)
+    if not steps:
+        raise BadInstruction(
+            f'decompose: no command in {text!r}; say one, for example "bring my cup, then my mug".'
+        )
+    return tuple(steps)
+
+
+def _completed(step: str, before: str) -> str:
+    """A step without a verb, with that of the step before it, and its place where it places."""
+    verb = STEP_VERB.match(before)
+    if verb is None:
+        return step
+    completed = f"{verb['verb']} {step}"
+    if PLACE.match(before) and not STEP_DESTINATION.search(step):
+        place = STEP_DESTINATION.search(before)
+        completed += "" if place is None else place.group()
+    return completed

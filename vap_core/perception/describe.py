@@ -1,28 +1,217 @@
-"""A personal object in words: the short and the long description of a hard prompt (P appendix).
-
-A captioner is any function (reference crops, category) -> Description. `AttributeCaptioner` counts
-colours, patterns and proportions: offline, always the same, in the words of `WORDS` alone.
-`ChatCaptioner` sends the crops to a vision-language model, as the paper does with GPT-5.1.
-"""
+"""Words for what is seen: colour names, and what distinguishes an object from its neighbours."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, Int64
 
 from vap_core.base.errors import BadEndpoint
-from vap_core.base.types import Description, PersonalObject, Rgb
-from vap_core.perception.attributes import PATTERNS, SHAPES, CropAttributes, measure_crop
+from vap_core.base.types import Boxes, Description, Mask, PersonalObject, Rgb, value
+from vap_core.perception.boxes import MARGIN
 from vap_core.perception.chat import (
     ChatEndpoint,
     endpoint_from_environment,
     question_message,
     request_answer,
 )
-from vap_core.perception.colours import COLOURS, SHADES, add_shade
 from vap_core.perception.protocols import Segmenter
+
+HUE_ENDS_DEG = (5.0, 48.0, 72.0, 104.0, 168.0, 232.0, 308.0, 340.0)
+HUE_NAMES = ("pink", "red", "orange", "yellow", "green", "teal", "blue", "purple")
+"""Hue angles in CIE Lab up to each end have that name; what is beyond the last is pink again."""
+NEUTRALS = ("black", "white", "grey", "brown", "beige")
+COLOURS = (*NEUTRALS, *HUE_NAMES)
+BLACK, WHITE, GREY, BROWN, BEIGE, PINK = range(6)
+"""Indices in `COLOURS`."""
+SHADES = ("light", "dark")
+GREY_CHROMA = 9.0
+"""Chroma below which a colour is a grey."""
+VIVID_CHROMA = 38.0
+"""Chroma from which warm colours are neither brown nor beige."""
+
+
+def colour_indices(rgb: Rgb, mask: Mask) -> Int64[np.ndarray, "h w"]:
+    """Of every pixel, the index of its colour in `COLOURS`.
+
+    What counts as white depends on the brightest grey pixels in `mask`, so that a white object is
+    white in its shaded parts too.
+    """
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    light = lab[..., 0]
+    chroma = np.hypot(lab[..., 1], lab[..., 2])
+    angle = np.degrees(np.arctan2(lab[..., 2], lab[..., 1])) % 360.0
+    hue = len(NEUTRALS) + np.digitize(angle, HUE_ENDS_DEG) % len(HUE_NAMES)
+
+    warm = (angle > 20) & (angle < 100) & (chroma < VIVID_CHROMA)
+    colour = np.where(warm, np.where(light < 55, BROWN, BEIGE), hue)
+    dark_red = (angle < 20) & (chroma < VIVID_CHROMA) & (light < 40)
+    colour = np.where(dark_red, BROWN, colour)
+    reddish = (angle > 340) | (angle < 45)
+    pale_red = reddish & (light > 55) & (chroma < 1.5 * VIVID_CHROMA) & ~warm
+    colour = np.where(pale_red, PINK, colour)
+
+    blue = (angle > 232) & (angle < 300)
+    faint = chroma < np.where(blue, 0.6 * GREY_CHROMA, GREY_CHROMA)
+    faint |= light < 14
+    faint |= (light > 80) & (chroma < 1.7 * GREY_CHROMA)
+    white_from = _white_lightness(light[faint & mask])
+    neutral = np.where(light < 26, BLACK, np.where(light < white_from, GREY, WHITE))
+    return np.where(faint, neutral, colour).astype(np.int64)
+
+
+def add_shade(name: str, lightness: float) -> str:
+    """The colour's name, after "light" or "dark" where its lightness (0..100) is extreme."""
+    light, dark = SHADES
+    if name in ("black", "white"):
+        return name
+    if lightness < 38:
+        return f"{dark} {name}"
+    if lightness > 74:
+        return f"{light} {name}"
+    return name
+
+
+def _white_lightness(grey_lightness: np.ndarray) -> float:
+    """The lightness from which a grey is white, given those of the object's grey pixels."""
+    if len(grey_lightness) == 0:
+        return 66.0
+    brightest = float(np.percentile(grey_lightness, 95))
+    if brightest <= 74:
+        return 66.0
+    return max(42.0, 0.55 * brightest)
+
+
+PATTERNS = ("stripes", "bands", "spots", "patches", "parts")
+SHAPES = ("tall", "wide", "compact")
+SIDE = 128
+"""Pixels of a crop's longer side while it is measured."""
+CENTRE_RADIUS = 0.5
+"""Pixels nearer to the middle of a crop than this, in half-sides, always belong to the object."""
+BRIGHT_LEVEL = 240.0
+"""The level to which an image's brightest parts are raised."""
+MIN_PATCH_SHARE = 0.0015
+"""Share of an object's pixels that a patch needs to be counted."""
+
+
+@value
+class CropAttributes:
+    """One crop: every colour's share of the object, lightness (0..100) and pattern; its shape."""
+
+    share: Mapping[str, float]
+    lightness: Mapping[str, float]
+    pattern: Mapping[str, str]
+    shape: str
+
+
+def measure_crop(rgb: Rgb, segmenter: Segmenter) -> CropAttributes:
+    """The attributes of the object in a crop, whose outline `segmenter` finds."""
+    small = _resize(rgb)
+    mask = _object_mask(small, segmenter)
+    return _measure(_equalise_exposure(small), mask)
+
+
+def pattern_of(part: Bool[np.ndarray, "h w"], whole: Mask) -> str:
+    """How the pixels of one colour lie on an object.
+
+    "stripes" are upright, "bands" go around it, "spots" are many and small, "patches" fewer and
+    larger; everything else is "parts".
+    """
+    size = int(whole.sum())
+    count, _, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8), connectivity=8)
+    pieces = stats[1:count]
+    pieces = pieces[pieces[:, cv2.CC_STAT_AREA] >= max(3, MIN_PATCH_SHARE * size)]
+    if not len(pieces):
+        return "parts"
+    object_height, object_width = _extent(whole)
+    width = pieces[:, cv2.CC_STAT_WIDTH]
+    height = pieces[:, cv2.CC_STAT_HEIGHT]
+    across = int(((width > 0.6 * object_width) & (height < 0.35 * object_height)).sum())
+    upright = int(((height > 2.2 * width) & (height > 0.25 * object_height)).sum())
+    largest = int(pieces[:, cv2.CC_STAT_AREA].max())
+    if across and across >= upright:
+        return "bands"
+    if upright >= 2:
+        return "stripes"
+    if len(pieces) >= 4 and largest < 0.08 * size:
+        return "spots"
+    if len(pieces) >= 2 and largest < 0.2 * size:
+        return "patches"
+    return "parts"
+
+
+def _resize(rgb: Rgb) -> Rgb:
+    """The crop with a longer side of `SIDE` pixels."""
+    scale = SIDE / max(rgb.shape[:2])
+    h = max(8, round(scale * rgb.shape[0]))
+    w = max(8, round(scale * rgb.shape[1]))
+    interpolation = cv2.INTER_LINEAR
+    if scale < 1:
+        interpolation = cv2.INTER_AREA
+    return cv2.resize(rgb, (w, h), interpolation=interpolation)
+
+
+def _object_mask(rgb: Rgb, segmenter: Segmenter) -> Mask:
+    """The object in a resized crop.
+
+    It has no holes, lacks its outermost pixels, and always covers the crop's centre.
+    """
+    from scipy.ndimage import binary_fill_holes
+
+    h, w = rgb.shape[:2]
+    margin = MARGIN * SIDE / (1 + 2 * MARGIN)
+    xyxy = np.array([[margin, margin, w - margin, h - margin]], np.float32)
+    mask = segmenter(rgb, Boxes(xyxy, np.ones(1, np.float32), ""))[0].astype(np.uint8)
+    mask = binary_fill_holes(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)))
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    x = np.linspace(-1, 1, w)
+    y = np.linspace(-1, 1, h)
+    return inner | (x[None] ** 2 + y[:, None] ** 2 < CENTRE_RADIUS**2)
+
+
+def _equalise_exposure(rgb: Rgb) -> Rgb:
+    """Raise the brightest parts to `BRIGHT_LEVEL`, by a factor of 1.4 at most."""
+    brightest = float(np.percentile(rgb.max(axis=2), 98))
+    gain = float(np.clip(BRIGHT_LEVEL / max(brightest, 1.0), 1.0, 1.4))
+    return np.clip(rgb * gain, 0, 255).astype(np.uint8)
+
+
+def _measure(rgb: Rgb, mask: Mask) -> CropAttributes:
+    lightness = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[..., 0]
+    indices = colour_indices(rgb, mask)
+    size = int(mask.sum())
+    share: dict[str, float] = {}
+    mean_lightness: dict[str, float] = {}
+    pattern: dict[str, str] = {}
+    for index, name in enumerate(COLOURS):
+        part = (indices == index) & mask
+        share[name] = float(part.sum() / size)
+        mean_lightness[name] = 0.0
+        if part.any():
+            mean_lightness[name] = float(lightness[part].mean())
+        pattern[name] = pattern_of(part, mask)
+    return CropAttributes(share, mean_lightness, pattern, _shape_of(mask))
+
+
+def _shape_of(mask: Mask) -> str:
+    height, width = _extent(mask)
+    ratio = height / width
+    if ratio > 1.6:
+        return "tall"
+    if ratio < 0.9:
+        return "wide"
+    return "compact"
+
+
+def _extent(mask: Mask) -> tuple[int, int]:
+    """Height and width of a mask's box, pixels."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    cols = np.flatnonzero(mask.any(axis=0))
+    return int(rows[-1] - rows[0] + 1), int(cols[-1] - cols[0] + 1)
+
 
 PROMINENT_SHARE = 0.06
 """Share of an object's pixels that a colour needs to be in the short description."""

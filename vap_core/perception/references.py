@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Int64
 from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
-from vap_core.perception.rows import describe_fault, embed_crops, row_fault
 
 THRESHOLD = 0.05
 """Photos of the object show one of its kind, so a box needs a lower score than a proposal does."""

@@ -1,17 +1,75 @@
-"""Stacks by name: the embedded one, offline on a CPU, and the foundation ones."""
+"""The stacks by name, mixed stacks, and what a stack of a caller's own is made of."""
 
-from collections.abc import Callable
-from dataclasses import replace
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from typing import Any
 
-from vap_core.base.device import check_device
-from vap_core.base.errors import one_of
-from vap_core.base.files import sha256_of
+import numpy as np
+
+from vap_core.base.errors import check_device, one_of
+from vap_core.base.files import sha256_of, source_digest
 from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
 from vap_core.perception.foundation.sources import mixed as mixed
-from vap_core.perception.own_parts import describe_parts
-from vap_core.perception.protocols import Stack, Thresholds
+from vap_core.perception.protocols import Stack, Thresholds, Tracker
+
+
+def describe_parts(make: Callable[[], Stack]) -> dict[str, Any]:
+    """The stack that `make` returns, as JSON.
+
+    Of each part it has the class, the class's source, and the attributes that are numbers (NumPy's,
+    too), words, arrays, lists of these, dataclasses or further parts. Others are left out:
+    dictionaries, a network's weights, what a closure or a partial holds.
+    """
+    stack = make()
+    about: dict[str, Any] = {"made by": source_digest(make), "encoder name": stack.encoder.name}
+    for field in fields(stack):
+        about[field.name] = _describe(getattr(stack, field.name), ())
+    return about
+
+
+def _describe(part: Any, within: tuple[int, ...]) -> Any:
+    """A part as JSON; `within` are the ids of the parts that hold it."""
+    if part is None or isinstance(part, str | int | float):
+        return part
+    if isinstance(part, np.generic):
+        number = part.item()
+        return number if isinstance(number, str | int | float) else repr(number)
+    if isinstance(part, np.ndarray):
+        return hashlib.sha256(str((part.dtype, part.shape)).encode() + part.tobytes()).hexdigest()
+    if id(part) in within:
+        return ""
+    within = (*within, id(part))
+    if isinstance(part, list | tuple):
+        return [_describe(each, within) for each in part if _counts(each)]
+    about = {
+        "kind": getattr(part, "__qualname__", type(part).__qualname__),
+        "code": source_digest(part),
+    }
+    for name, value in _attributes(part):
+        if _counts(value):
+            about[name] = _describe(value, within)
+    return about
+
+
+def _counts(value: Any) -> bool:
+    """Whether a value is one that `describe_parts` describes."""
+    if isinstance(value, str | int | float | np.generic | np.ndarray | list | tuple):
+        return True
+    return callable(value) or isinstance(value, Tracker) or is_dataclass(value)
+
+
+def _attributes(part: Any) -> Iterator[tuple[str, Any]]:
+    """The attributes of an object itself; a class has none."""
+    if isinstance(part, type):
+        return
+    names = dict.fromkeys(getattr(part, "__dict__", ()))
+    for kind in type(part).__mro__:
+        names |= dict.fromkeys(getattr(kind, "__slots__", ()))
+    for name in names:
+        yield name, getattr(part, name, None)
+
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)
 """Chosen on development views, five references each. Familiar: 209 rendered opening views of the
@@ -27,25 +85,18 @@ def load_embedded() -> Stack:
     Raises: MissingWeights: a file of weights is absent, or its checksum differs from the
         manifest's.
     """
-    from vap_core.perception.embedded import (
-        cut_segmenter,
-        detector,
-        encoder,
-        local_features,
-        open_detector,
-        tracker,
-    )
+    from vap_core.perception.embedded import encoder, proposer, segmenter, tracker
 
     return Stack(
         name="embedded",
-        detector=open_detector.load(),
+        detector=proposer.load_open(),
         encoder=encoder.load(),
-        segmenter=cut_segmenter.load(),
+        segmenter=segmenter.load_cut(),
         tracker=tracker.load(),
-        by_category=detector.load(),
+        by_category=proposer.load(),
         unfamiliar_encoder=encoder.load_unfamiliar(),
         thresholds=EMBEDDED_THRESHOLDS,
-        verifier=local_features.load(),
+        verifier=encoder.load_local(),
     )
 
 
@@ -76,7 +127,7 @@ def load_own(name: str) -> Stack:
     Raises: as load_stack; BadOutput: the file of thresholds is damaged.
     """
     from vap_core.perception.foundation.store import store_folder
-    from vap_core.perception.kept_thresholds import read_thresholds
+    from vap_core.perception.protocols import read_thresholds
 
     stack = load_stack(name)
     kept = read_thresholds(store_folder(), name, stack.encoder.name)
@@ -116,9 +167,9 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
     Raises: UnknownName; MissingWeights: a model's files are not here; what the caller's stack
         raises.
     """
-    from vap_core.perception.embedded.weights import weights_sha256
+    from vap_core.perception.embedded.networks import weights_sha256
     from vap_core.perception.foundation.store import locked_sha256, store_folder
-    from vap_core.perception.kept_thresholds import thresholds_file
+    from vap_core.perception.protocols import thresholds_file
 
     found: dict[str, Any] = {"weights": weights_sha256()}
     if ":" in name or name in KINDS:

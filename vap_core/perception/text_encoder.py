@@ -93,8 +93,7 @@ def _installed_model() -> Path | None:
 
 def _fetch_model() -> Path:
     """Copy the pinned files from the hub, once. Raises: MissingWeights."""
-    from vap_core.perception.foundation.downloads import pull
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.store import pull, store_folder
 
     def say(line: str) -> None:
         print(f"note: the text encoder, copied once: {line}", file=sys.stderr)

@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from vap_core.base import palette
-from vap_core.base.palette import Rgb8, rgb8
+from vap_core.base import pictures
+from vap_core.base.pictures import Rgb8, rgb8
 
-TARGET = rgb8(palette.TARGET)
-ELECTED = rgb8(palette.ELECTED)
-LOOKALIKES = tuple(rgb8(colour) for colour in palette.LOOKALIKES)
-CAMERAS = tuple(rgb8(colour) for colour in palette.CAMERAS)
-MUTED = rgb8(palette.FRAME)
+TARGET = rgb8(pictures.TARGET)
+ELECTED = rgb8(pictures.ELECTED)
+LOOKALIKES = tuple(rgb8(colour) for colour in pictures.LOOKALIKES)
+CAMERAS = tuple(rgb8(colour) for colour in pictures.CAMERAS)
+MUTED = rgb8(pictures.FRAME)
 """What has no part of its own: candidates that were not elected, the robot."""
 BACKGROUND = (24, 28, 36)
 SERIES = (*CAMERAS[:2], *LOOKALIKES)
@@ -26,7 +26,7 @@ def camera_colour(i: int) -> Rgb8:
 
 def object_colours(names: Sequence[str], target: str, goal: str) -> dict[str, Rgb8]:
     """The colour of every object of a scene, by its part in the task."""
-    colours = palette.object_colours(names, target, goal)
+    colours = pictures.object_colours(names, target, goal)
     return {name: rgb8(colour) for name, colour in colours.items()}
 
 

@@ -12,8 +12,7 @@ from vap_core.recording.colours import BACKGROUND, image_root, target_suffix
 from vap_core.recording.entities.scene import mean_placement
 from vap_core.recording.entities.votes import vote_picture_entity
 from vap_core.recording.stream import StoredBlueprint
-from vap_core.rollout.failure import Diagnosis
-from vap_core.rollout.types import EpisodeHeader
+from vap_core.rollout.types import Diagnosis, EpisodeHeader
 
 type Part = rrb.Container | rrb.View
 QUERY_NAMES = {

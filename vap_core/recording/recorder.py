@@ -28,8 +28,8 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.errors import BadOutput
+from vap_core.base.files import code_version
 from vap_core.base.types import Event
-from vap_core.base.version import code_version
 from vap_core.recording.colours import image_root
 from vap_core.recording.entities.curves import (
     log_method_styles,
@@ -78,8 +78,15 @@ from vap_core.recording.stream import (
     temporary_path,
 )
 from vap_core.recording.texts import describe_outcome, instruction_document, verdict_document
-from vap_core.rollout.failure import Diagnosis, Explain, Explanation
-from vap_core.rollout.types import Episode, EpisodeHeader, Frame, SubGoalSpan
+from vap_core.rollout.types import (
+    Diagnosis,
+    Episode,
+    EpisodeHeader,
+    Explain,
+    Explanation,
+    Frame,
+    SubGoalSpan,
+)
 from vap_core.simulation.types import EpisodeRow, Outcome
 
 OUTCOME_LEVELS: dict[str, Literal["INFO", "WARN", "ERROR"]] = {

@@ -18,11 +18,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.experimental import ViewerClient
 
-from vap_core.base.errors import BadOutput, BadRecording, BadStudy, MissingGL
-from vap_core.base.extras import require
-from vap_core.base.palette import RIGHT_MARK, WRONG_MARK, method_marks, on_dark, rgb8
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy, MissingGL, require
+from vap_core.base.media import Mp4
+from vap_core.base.pictures import RIGHT_MARK, WRONG_MARK, method_marks, on_dark, rgb8
 from vap_core.base.types import Rgb
-from vap_core.base.video import Mp4
 from vap_core.recording.colours import BACKGROUND, image_root
 from vap_core.recording.layout import (
     QUERY_NAMES,

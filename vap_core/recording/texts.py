@@ -3,10 +3,9 @@
 import rerun as rr
 
 from vap_core.base.events import describe_ballot, describe_rejection
-from vap_core.base.palette import LEGEND
+from vap_core.base.pictures import LEGEND
 from vap_core.base.types import Grounding, PersonalObject
-from vap_core.rollout.failure import Diagnosis
-from vap_core.rollout.types import EpisodeHeader
+from vap_core.rollout.types import Diagnosis, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Outcome
 
 

@@ -16,35 +16,42 @@ import numpy as np
 
 from vap_core.base.errors import BadAction, BadCrop, BadStudy, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
-from vap_core.policies.hooks import AttentionMaps, observe_attention
-from vap_core.policies.protocol import Policy, PolicyInput, PrivilegedPolicy
-from vap_core.rollout import audit
-from vap_core.rollout.coverage import mask_coverage
-from vap_core.rollout.late_masks import LateMasks
-from vap_core.rollout.policy_call import (
+from vap_core.policies.protocol import (
+    AttentionMaps,
+    Policy,
+    PolicyInput,
+    PrivilegedPolicy,
+    observe_attention,
+)
+from vap_core.rollout import calls
+from vap_core.rollout.calls import (
     check_chunks,
     check_limit,
     check_policy,
     checked_plan,
+    only_queries,
     policy_call,
+    query_phrases,
 )
-from vap_core.rollout.prompters.protocol import (
-    PromptContext,
-    Prompter,
-    SceneTruth,
-    checked_steps,
-    unchanged,
+from vap_core.rollout.prompters import PromptContext, Prompter, SceneTruth, checked_steps, unchanged
+from vap_core.rollout.running import (
+    LateMasks,
+    RunningEpisode,
+    SubGoalSink,
+    WaitingSink,
+    begins,
+    ending,
+    next_subgoal,
+    subgoal_number,
 )
-from vap_core.rollout.queries import only_queries, query_phrases
-from vap_core.rollout.running import RunningEpisode, SubGoalSink, WaitingSink
 from vap_core.rollout.running import Sink as Sink
-from vap_core.rollout.subgoals import begins, ending, next_subgoal, subgoal_number
 from vap_core.rollout.types import (
     Episode,
     EpisodeHeader,
     Frame,
     MaskCoverage,
     SubGoalSpan,
+    mask_coverage,
 )
 from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
@@ -422,10 +429,10 @@ def _call_policy(
         observer = observe_attention([query_phrases(episode.goal) for episode in calling])
     with observer as maps:
         if trial.audit:
-            after, chunks, consumed = audit.plan(policy, states, prompted, raw)
+            after, chunks, consumed = calls.plan(policy, states, prompted, raw)
             for i, episode in enumerate(calling):
                 step = episode.judge.steps
-                episode.consumed += audit.compare(step, prompted[i], raw[i], consumed[i])
+                episode.consumed += calls.compare(step, prompted[i], raw[i], consumed[i])
         else:
             returned = policy.plan(states, prompted)
             after, chunks = checked_plan(returned, policy.label, len(calling))

@@ -1,20 +1,49 @@
-"""One episode under way, and where its frames stream to."""
+"""An episode while it runs: its sub-goals, its expert, and masks that are drawn only when needed.
+
+An episode that is dropped unless it fails keeps its states, a few kilobytes a step; the simulator
+draws the true masks from them.
+"""
 
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from vap_core.base.types import Event
-from vap_core.policies.hooks import AttentionMap
-from vap_core.rollout.late_masks import LateMasks
+from vap_core.policies.protocol import AttentionMap, Policy, PrivilegedPolicy
+from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.rollout.types import ConsumedInput, EpisodeHeader, Frame, SubGoalSpan
-from vap_core.simulation.env import Env
+from vap_core.simulation import homing
+from vap_core.simulation.env import Env, Snapshot
 from vap_core.simulation.homing import Homing
 from vap_core.simulation.suites.rules import Judge
-from vap_core.simulation.types import EpisodeRow, Outcome
+from vap_core.simulation.types import Action, EpisodeRow, Outcome, of_subgoals
+
+
+class LateMasks:
+    """The states of one episode's steps; `make_env` makes an environment to draw them in."""
+
+    def __init__(self, make_env: Callable[[], Env]) -> None:
+        self._make_env = make_env
+        self._env: Env | None = None
+        self._snapshots: dict[int, Snapshot] = {}
+
+    def keep(self, frame_index: int, snapshot: Snapshot) -> None:
+        """Keep the state of a step whose masks are wanted later."""
+        self._snapshots[frame_index] = snapshot
+
+    def draw(self, frame: Frame) -> Frame:
+        """The frame with its masks; one whose state was not kept stays as it is."""
+        snapshot = self._snapshots.pop(frame.frame_index, None)
+        if snapshot is None:
+            return frame
+        if self._env is None:
+            self._env = self._make_env()
+        self._env.restore(snapshot)
+        drawn = self._env.truth(masks=True)
+        return replace(frame, truth=replace(frame.truth, masks=drawn.masks, hand=drawn.hand))
 
 
 @runtime_checkable
@@ -96,3 +125,92 @@ class RunningEpisode:
     def over(self) -> bool:
         """Whether no action is left to take."""
         return self.homing is None and self.is_last and self.judge.over
+
+
+type AnyPolicy = Policy[Any] | PrivilegedPolicy[Any]
+
+
+def next_subgoal(episode: RunningEpisode, policy: AnyPolicy) -> None:
+    """Where a sub-goal is over and another follows: bring the hand home, then begin that one.
+
+    It is grounded again, on the scene as it is then, and the policy begins anew.
+    """
+    if episode.homing is None:
+        if episode.is_last or not episode.judge.over:
+            return
+        ended = episode.judge.outcome()
+        episode.ended.append(ended)
+        step = episode.judge.steps
+        text = f"sub-goal {episode.stage + 1} of {episode.row.stages} ends: {ended.status}"
+        episode.notes.append(Event(step, "INFO" if ended.success else "WARN", text))
+        episode.homing = homing.begin(episode.env)
+        episode.prompting = False
+    else:
+        episode.homing = homing.advance(episode.homing, episode.env)
+    episode.queue.clear()
+    if episode.homing.part != "there":
+        episode.queue.append(homing.action(episode.homing, episode.env))
+        return
+    episode.homing = None
+    episode.stage += 1
+    row = episode.row.at(episode.stage)
+    episode.env.pursue(row)
+    first = episode.judge.steps
+    episode.judge = Judge.start(row, episode.judge.sizes_m, episode.env.truth(), first)
+    episode.notes.append(begins(episode))
+    rng = np.random.default_rng([row.seed, row.episode, episode.stage])
+    episode.policy_state = policy.start(rng)
+
+
+def begins(episode: RunningEpisode) -> Event:
+    number = f"{episode.stage + 1} of {episode.row.stages}"
+    text = f'sub-goal {number} begins: "{episode.goal.instruction}"'
+    return Event(episode.judge.steps, "INFO", text)
+
+
+def subgoal_number(episode: RunningEpisode) -> int | None:
+    """Frame.subgoal."""
+    if not episode.row.subgoals:
+        return None
+    return 0 if episode.homing is not None else episode.stage + 1
+
+
+def ending(
+    episode: RunningEpisode, status: Literal["error"] | None = None, detail: str = ""
+) -> Outcome:
+    """How the episode ended; of several sub-goals, how each did."""
+    last = episode.judge.outcome(status, detail)
+    if not episode.row.subgoals:
+        return last
+    if episode.homing is None:
+        return of_subgoals([*episode.ended, last], episode.row.stages, episode.judge.steps)
+    # On the way home no sub-goal is under way: those that ended stay as they are.
+    whole = of_subgoals(episode.ended, episode.row.stages, episode.judge.steps)
+    return replace(whole, status=last.status, success=False, detail=last.detail)
+
+
+def expert_steps(
+    env: Env,
+    row: EpisodeRow,
+    expert: Expert,
+    state: ExpertState,
+    disturb: Callable[[Action], Action] | None = None,
+) -> Iterator[tuple[Judge, Action | None]]:
+    """Yield the judge and the planned action before every step, and last the final judge with None.
+
+    `env` stands at the start of `row`. The action is executed, changed by `disturb` if there is
+    one, when the next step is asked for.
+
+    Raises: OutOfReach.
+    """
+    sizes = {}
+    for place in row.placements:
+        sizes[place.model] = env.scene.sizes_m[place.model]
+    judge = Judge.start(row, sizes, env.truth())
+    while not judge.done and judge.steps < row.max_steps:
+        (state,), (chunk,) = expert.plan_from_simulation([state], [env])
+        action = chunk[0].astype(np.float32)
+        yield judge, action
+        env.step(action if disturb is None else disturb(action))
+        judge = judge.step(env.truth())
+    yield judge, None

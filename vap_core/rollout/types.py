@@ -1,13 +1,26 @@
-"""What a rollout yields: episodes, their frames, and what the prompts covered."""
+"""What a rollout yields: episodes, their frames, failures, and what the prompts covered."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
-from vap_core.base.types import Association, Camera, Event, Grounding, Rgb, Track, Views, value
+from vap_core.base.types import (
+    Association,
+    Attended,
+    Camera,
+    Event,
+    Grounding,
+    Mask,
+    Rgb,
+    Track,
+    Views,
+    value,
+)
+from vap_core.perception.boxes import box_iou, mask_box, mask_iou
 from vap_core.simulation.types import EE_ACTION, Action, EpisodeRow, Outcome, Truth
 
 
@@ -204,3 +217,172 @@ class Episode:
             columns[f"subgoal_{i + 1}"] = bool(ended) and ended[0].success
             done += columns[f"subgoal_{i + 1}"]
         return {"subgoals_done": done, **columns}
+
+
+type Case = Literal["case 1", "case 2", "case 3", "unprompted", "unlabelled"]
+MANIPULATION = ("wrong object", "collision", "missed grasp", "slip", "misplacement", "timeout")
+CASES: dict[Case, tuple[str, ...]] = {
+    "case 1": (
+        "no proposal",
+        "not in view",
+        "shifted proposal",
+        "distractor vote",
+        "poor mask",
+        "drift",
+    ),
+    "case 2": ("views disagree", "views drift apart"),
+    "case 3": MANIPULATION,
+    "unprompted": MANIPULATION,
+    "unlabelled": ("nothing found", "not in view", "lost track", "narrow vote", "no signal"),
+}
+"""Every sub-case of every case, from perception to manipulation."""
+
+
+@value
+class Diagnosis:
+    """Why one episode failed.
+
+    It has the deciding frame and camera ("" where none decides), a sentence, and evidence in
+    numbers and names.
+    """
+
+    case: Case
+    sub_case: str
+    frame_index: int
+    camera: str
+    evidence: Mapping[str, float | str]
+    confidence: float
+    sentence: str
+
+    def columns(self) -> dict[str, Any]:
+        """Its part of a row of a results table."""
+        evidence = {}
+        for name, part in self.evidence.items():
+            evidence[name] = round(part, 4) if isinstance(part, float) else part
+        return {
+            "case": self.case,
+            "sub_case": self.sub_case,
+            "deciding_frame": self.frame_index,
+            "deciding_camera": self.camera,
+            "case_confidence": self.confidence,
+            "case_sentence": self.sentence,
+            "case_evidence": json.dumps(evidence),
+        }
+
+
+NO_DIAGNOSIS: dict[str, Any] = {
+    "case": "",
+    "sub_case": "",
+    "deciding_frame": -1,
+    "deciding_camera": "",
+    "case_confidence": float("nan"),
+    "case_sentence": "",
+    "case_evidence": "",
+}
+"""The columns of an episode that did not fail."""
+
+
+@value
+class EpisodeTrace:
+    """What the diagnosis reads, one entry per recorded step.
+
+    Nothing in it depends on a threshold. `others` are the objects other than target and goal that
+    the robot touched in a step, `touches` says whether the target was one. `gap_m` is the distance
+    of the tcp from the target's bounding box, `lift_m` how much higher each object is than at
+    first, `moved_m` how far it has moved. `grip` is the gripper's command, 0 closed .. 1 open, nan
+    at the terminal frame, which has none. `candidates` counts proposals by camera; `rejected` are
+    the cameras in which the method says that the target is not in view, `overruled` those in which
+    something else than the vote chose the candidate.
+    """
+
+    target: str
+    rule: str
+    steps: tuple[int, ...]
+    coverage: tuple[tuple[MaskCoverage, ...], ...]
+    others: tuple[tuple[str, ...], ...]
+    touches: tuple[bool, ...]
+    held: tuple[frozenset[str], ...]
+    gap_m: Float64[np.ndarray, " t"]
+    lift_m: Mapping[str, Float64[np.ndarray, " t"]]
+    moved_m: Mapping[str, Float64[np.ndarray, " t"]]
+    grip: Float64[np.ndarray, " t"]
+    candidates: Mapping[str, int]
+    prompted: bool
+    rejected: frozenset[str] = frozenset()
+    overruled: frozenset[str] = frozenset()
+
+
+@value
+class Explanation:
+    """The trace of an episode, where there is ground truth, and its diagnosis, where it failed."""
+
+    trace: EpisodeTrace | None
+    diagnosis: Diagnosis | None
+
+
+type Explain = Callable[[Episode], Explanation]
+
+
+MAJORITY = 0.5
+"""The share of a mask that must lie on an object for the mask to cover it."""
+
+
+def mask_coverage(
+    attended: Attended, truth: Truth, target: str, *, opening: bool
+) -> tuple[MaskCoverage, ...]:
+    """Every view's prompt for the first target of the instruction; `truth` has masks.
+
+    `opening`: t = 0, when proposals count too, of a method that grounds.
+    """
+    found = []
+    for camera, tracks in attended.tracks.items():
+        if not tracks:
+            continue
+        mask = tracks[0].mask
+        masks = truth.masks[camera]
+        true = masks.get(target)
+        pixels = 0 if true is None else int(true.sum())
+        overlap = 0.0
+        if mask is not None and true is not None and mask.any():
+            overlap = mask_iou(mask, true)
+        proposal = float("nan")
+        groundings = attended.groundings.get(camera, ())
+        if opening and groundings and true is not None and pixels:
+            proposal = best_proposal(groundings[0], true)
+        coverage = MaskCoverage(
+            camera=camera,
+            object=covered_object(mask, masks),
+            iou=overlap,
+            pixels=pixels,
+            proposal=proposal,
+        )
+        found.append(coverage)
+    return tuple(found)
+
+
+def covered_object(mask: Mask | None, masks: Mapping[str, Mask]) -> str | None:
+    """The object on which most of a mask lies, "" when there is none such.
+
+    None for no mask, or an empty one.
+    """
+    if mask is None or not mask.any():
+        return None
+    best = ""
+    most = 0
+    for name, of_object in masks.items():
+        pixels = int((mask & of_object).sum())
+        if pixels > most:
+            best = name
+            most = pixels
+    if most >= MAJORITY * int(mask.sum()):
+        return best
+    return ""
+
+
+def best_proposal(grounding: Grounding, true: Mask) -> float:
+    """The best box IoU of any candidate with the target's true mask."""
+    box = mask_box(true)
+    if box is None or not len(grounding.candidates):
+        return 0.0
+    overlap = box_iou(grounding.candidates.xyxy, box[None])
+    return float(np.max(overlap))

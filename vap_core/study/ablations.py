@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.figures import write_png
-from vap_core.base.files import writing
-from vap_core.base.palette import method_marks
-from vap_core.base.tables import align
+from vap_core.base.files import align, writing
+from vap_core.base.pictures import method_marks, write_png
 from vap_core.base.types import value
-from vap_core.policies.names import TEMPERATURE, checkpoint_of
+from vap_core.policies.protocol import TEMPERATURE, checkpoint_of
 from vap_core.study import paper, store
 from vap_core.study.engine import Record, run
 from vap_core.study.logs import hiding_lines, switching_lines

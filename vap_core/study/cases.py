@@ -8,8 +8,7 @@ import numpy as np
 
 from vap_core.associate import compare_views
 from vap_core.base.events import describe_rejection, is_lost
-from vap_core.rollout.failure import Case, Diagnosis, EpisodeTrace
-from vap_core.rollout.types import Episode, Frame, MaskCoverage
+from vap_core.rollout.types import Case, Diagnosis, Episode, EpisodeTrace, Frame, MaskCoverage
 from vap_core.simulation import robots
 from vap_core.simulation.control import pose_transform
 from vap_core.simulation.suites import suite

@@ -7,17 +7,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64
 
-from vap_core.base.figures import (
+from vap_core.base.pictures import CASES as CASE_COLOURS
+from vap_core.base.pictures import (
+    FRAME,
     FURTHER_POLICY_MARKERS,
+    GRID,
+    METHODS,
     OTHER,
     POLICY_MARKERS,
+    TEXT,
     TIER_COLOURS,
     WINNER,
     empty_figure,
+    method_marks,
+    rgb8,
+    suite_colour,
 )
-from vap_core.base.palette import CASES as CASE_COLOURS
-from vap_core.base.palette import FRAME, GRID, METHODS, TEXT, method_marks, rgb8, suite_colour
-from vap_core.rollout.failure import CASES
+from vap_core.rollout.types import CASES
 from vap_core.simulation.assets.objects import TIERS
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study.diagnosis import STAGES

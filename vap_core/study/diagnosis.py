@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.rollout.failure import NO_DIAGNOSIS, Diagnosis, EpisodeTrace, Explanation
-from vap_core.rollout.types import Episode
+from vap_core.rollout.types import NO_DIAGNOSIS, Diagnosis, Episode, EpisodeTrace, Explanation
 from vap_core.study.cases import (
     THRESHOLDS,
     Thresholds,

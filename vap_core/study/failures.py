@@ -16,13 +16,18 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.condition import rows_matching
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy, one_of
-from vap_core.base.files import take_name, write_atomic, writing
-from vap_core.base.tables import align
+from vap_core.base.files import (
+    align,
+    code_digest,
+    code_version,
+    rows_matching,
+    take_name,
+    write_atomic,
+    writing,
+)
 from vap_core.base.types import value
-from vap_core.base.version import code_digest, code_version
-from vap_core.rollout.failure import CASES
+from vap_core.rollout.types import CASES
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow, Outcome
 from vap_core.study import store
@@ -175,11 +180,10 @@ def recorder_digest() -> str:
     Comments, docstrings and line breaks do not count.
     """
     from vap_core import recording
-    from vap_core.base import palette, vote_picture
+    from vap_core.base import pictures
 
-    digests = [code_digest(Path(str(recording.__file__)).parent, without=NOT_DRAWN)]
-    for module in (palette, vote_picture):
-        digests.append(code_digest(Path(str(module.__file__))))
+    drawn = Path(str(recording.__file__)).parent
+    digests = [code_digest(drawn, without=NOT_DRAWN), code_digest(Path(str(pictures.__file__)))]
     return store.digest({"modules": digests})
 
 

@@ -17,8 +17,7 @@ from vap_core.attend import Attender, AttendState, are_shown
 from vap_core.base.types import Attended, Camera, Colour, Mask, Rgb
 from vap_core.perception.boxes import mask_box
 from vap_core.prompt import ALPHA
-from vap_core.rollout.prompters.protocol import PromptContext
-from vap_core.rollout.prompters.tint import TintPrompter
+from vap_core.rollout.prompters import PromptContext, TintPrompter
 from vap_core.simulation.cameras import project
 from vap_core.simulation.control import pose_transform
 from vap_core.simulation.types import Observation, Pose

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.parquet import read_parquet
-from vap_core.policies.hooks import TEXT
-from vap_core.rollout.prompters.switch import SWITCHED
+from vap_core.base.files import read_parquet
+from vap_core.policies.protocol import TEXT
+from vap_core.rollout.prompters import SWITCHED
 from vap_core.rollout.types import Episode, Frame, MaskCoverage
 from vap_core.simulation import robots
 from vap_core.simulation.occluder import Occlusion

@@ -12,25 +12,27 @@ from typing import Any
 from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
+from vap_core.base.files import source_digest
 from vap_core.base.types import Colour
-from vap_core.base.version import source_digest
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.prompt import PALETTE, Tint
-from vap_core.rollout.prompters.oracle import Oracle, OraclePrompter
-from vap_core.rollout.prompters.protocol import Prompter
-from vap_core.rollout.prompters.switch import Switch, SwitchPrompter
-from vap_core.rollout.prompters.text import (
+from vap_core.rollout.prompters import (
     HardPrompt,
+    Oracle,
+    OraclePrompter,
     OtherCommand,
+    Prompter,
     SoftPrompt,
+    Switch,
+    SwitchPrompter,
+    TintPrompter,
     generic,
     hard_prompt,
     say,
     soft_prompt,
 )
-from vap_core.rollout.prompters.tint import TintPrompter
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.scenes import Scene

@@ -20,12 +20,9 @@ import numpy as np
 
 from vap_core import __version__
 from vap_core.attend import Attender
-from vap_core.base.commands import command
-from vap_core.base.csv_rows import read_rows
-from vap_core.base.errors import BadObject, BadStudy
-from vap_core.base.files import write_atomic, writing
-from vap_core.base.photos import load_photo
-from vap_core.base.tables import Rows, align
+from vap_core.base.errors import BadObject, BadStudy, command
+from vap_core.base.files import Rows, align, read_rows, write_atomic, writing
+from vap_core.base.media import load_photo
 from vap_core.base.types import Grounding, Rgb, value
 from vap_core.memory import kind_instead
 from vap_core.perception.boxes import box_iou, mask_iou

@@ -19,13 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadEndpoint, VapError
-from vap_core.base.files import DATA
-from vap_core.base.tables import Rows, align
+from vap_core.base.files import DATA, Rows, align, code_version
 from vap_core.base.types import Description, Instruction, PersonalObject, value
-from vap_core.base.version import code_version
 from vap_core.instruction import Parser
-from vap_core.instruction.context import Context
-from vap_core.instruction.history import Use
+from vap_core.instruction.context import Context, Use
 from vap_core.memory import recall
 from vap_core.study.stats import bootstrap_interval, rate
 from vap_core.study.store import encode_table, publish_tables

@@ -27,11 +27,9 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from vap_core import __version__
 from vap_core.attend import Attender
-from vap_core.base.csv_rows import read_rows
 from vap_core.base.errors import BadPhoto, BadPhotoSet
-from vap_core.base.files import write_atomic, writing
-from vap_core.base.photos import load_mask, load_photo, photos_in
-from vap_core.base.tables import Rows, align
+from vap_core.base.files import Rows, align, read_rows, write_atomic, writing
+from vap_core.base.media import load_mask, load_photo, photos_in
 from vap_core.base.types import Boxes, Grounding, Mask, PersonalObject, Rgb, value
 from vap_core.memory import (
     NAME,
@@ -43,8 +41,7 @@ from vap_core.memory import (
     save,
 )
 from vap_core.perception.boxes import box_iou, mask_iou
-from vap_core.perception.candidates import Candidates, Proposals, embed, segment
-from vap_core.perception.proof import prove
+from vap_core.perception.candidates import Candidates, Proposals, embed, prove, segment
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
 from vap_core.study import store

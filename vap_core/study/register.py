@@ -15,12 +15,12 @@ import numpy as np
 
 from vap_core.base.errors import BadMemory, BadPhoto
 from vap_core.base.files import writing
-from vap_core.base.photos import load_mask, load_photo, photos_in
+from vap_core.base.media import is_video, load_mask, load_photo, photos_in, sharp_frames
 from vap_core.base.types import PersonalObject, Rgb, value
-from vap_core.base.video import is_video, sharp_frames
-from vap_core.instruction.owners import fold
+from vap_core.instruction.context import fold
 from vap_core.memory import load, object_files, object_path, remember
 from vap_core.perception.boxes import mask_box
+from vap_core.perception.candidates import embed_crops
 from vap_core.perception.protocols import Encoder, Stack
 from vap_core.perception.references import (
     LEAST_COSINE,
@@ -30,7 +30,6 @@ from vap_core.perception.references import (
     choose_references,
     whole_photos,
 )
-from vap_core.perception.rows import embed_crops
 from vap_core.vote import similarity, vote
 
 if TYPE_CHECKING:

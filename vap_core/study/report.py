@@ -13,12 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from vap_core.base.commands import command
-from vap_core.base.errors import BadOutput, BadRecording
-from vap_core.base.figures import write_png
-from vap_core.base.files import write_atomic, writing
-from vap_core.base.palette import METHODS, method_marks
-from vap_core.base.tables import Rows, align, markdown, signed_interval
+from vap_core.base.errors import BadOutput, BadRecording, command
+from vap_core.base.files import Rows, align, markdown, signed_interval, write_atomic, writing
+from vap_core.base.pictures import METHODS, method_marks, write_png
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import extent_m, get_object
 from vap_core.simulation.suites.rules import rejudge

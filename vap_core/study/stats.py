@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from vap_core.base.tables import signed_interval
+from vap_core.base.files import signed_interval
 from vap_core.base.types import value
 from vap_core.simulation import suites
 from vap_core.simulation.suites import ABSENT

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.base.condition import select
 from vap_core.base.errors import BadRecording, BadStudy
-from vap_core.base.parquet import read_parquet
+from vap_core.base.files import read_parquet, select
 from vap_core.rollout.types import Episode, SubGoalSpan
 from vap_core.study import store
 from vap_core.study.cases import has_truth, trace_episode

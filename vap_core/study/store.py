@@ -14,8 +14,14 @@ from typing import IO, TYPE_CHECKING, Any
 from uuid import uuid4
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, read_file, remove_scratch, write_atomic, writing
-from vap_core.base.parquet import read_arrow
+from vap_core.base.files import (
+    parse_json,
+    read_arrow,
+    read_file,
+    remove_scratch,
+    write_atomic,
+    writing,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

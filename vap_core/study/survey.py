@@ -7,11 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.errors import BadOutput, one_of
-from vap_core.base.extras import require
-from vap_core.base.files import write_atomic, writing
-from vap_core.base.parquet import read_parquet
-from vap_core.base.tables import align
+from vap_core.base.errors import BadOutput, one_of, require
+from vap_core.base.files import align, read_parquet, write_atomic, writing
 from vap_core.base.types import value
 from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.simulation import suites

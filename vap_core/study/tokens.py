@@ -18,21 +18,20 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import write_atomic, writing
-from vap_core.base.parquet import read_parquet
-from vap_core.base.tables import align as text_table
+from vap_core.base.files import align as text_table
+from vap_core.base.files import read_parquet, write_atomic, writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.perception.boxes import mask_box
 from vap_core.policies.lerobot.checkpoints import fingerprint
-from vap_core.policies.mini_pi0 import teach_token
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import (
     Photos,
     TokenTraining,
+    align,
     answers,
     lessons,
     recognized,
 )
-from vap_core.policies.mini_pi0.token_alignment import align
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
 CALLER = "measure tokens"
 KS = (1, 3, 5, 7)
 """Numbers of photos to learn from."""
-USUAL_K = teach_token.K
+USUAL_K = learned_token.K
 SHARES = (0.05, 0.15, 0.3, 0.5, 1.0)
 """Shares of a training after which the token is measured, besides before its first step."""
 OTHER = "other objects"
@@ -106,7 +105,7 @@ class Tokens:
         return {
             "survey": "tokens",
             "epochs": self.epochs,
-            "views": teach_token.VIEWS,
+            "views": learned_token.VIEWS,
             "vlms": models,
             "policies": policies,
             **{name: shown[name] for name in ("version", "lists", "world")},
@@ -294,9 +293,9 @@ def _negatives(
     """Photos of every look-alike of a task's target, and of other objects."""
     rows = suites.rows(suite, task)
     rivals = {}
-    for name in teach_token.lookalikes(rows):
-        rivals[name] = tuple(reference_views(get_object(name), teach_token.VIEWS, seed))
-    return rivals, teach_token.other_objects(rows, seed)
+    for name in learned_token.lookalikes(rows):
+        rivals[name] = tuple(reference_views(get_object(name), learned_token.VIEWS, seed))
+    return rivals, learned_token.other_objects(rows, seed)
 
 
 def _photos(suite: str, task: str, seed: int, k: int) -> Photos:
@@ -311,7 +310,7 @@ def _photos(suite: str, task: str, seed: int, k: int) -> Photos:
 
 def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
     """Photos that no training saw, by the object that they show; the target's first."""
-    photos = _photos(suite, task, 1, teach_token.VIEWS)
+    photos = _photos(suite, task, 1, learned_token.VIEWS)
     target = suites.rows(suite, task, 1)[0].target
     rivals, others = _negatives(suite, task, 1)
     return {target: photos.own, **rivals, OTHER: others}
@@ -319,7 +318,7 @@ def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
 
 def _model_folder(suite: str) -> Path:
     """The shipped model that a suite's policy grew from."""
-    return teach_token.model_of_policy(shipped(suite))
+    return learned_token.model_of_policy(shipped(suite))
 
 
 @lru_cache(maxsize=2)

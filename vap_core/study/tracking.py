@@ -29,7 +29,7 @@ from vap_core.perception.embedded.backbone import features
 from vap_core.perception.protocols import Stack, TargetTracker
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.expert import Expert
-from vap_core.rollout.expert_loop import expert_steps
+from vap_core.rollout.running import expert_steps
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.env import Env

@@ -10,30 +10,32 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core import __version__
-from vap_core.base.commands import command
-from vap_core.base.errors import BadStudy, one_of
-from vap_core.base.extras import require
+from vap_core.base.errors import BadStudy, command, one_of, require
 from vap_core.base.types import Rgb, value
 from vap_core.memory import load_bank, register, save
 from vap_core.perception.describe import AttributeCaptioner, with_description
 from vap_core.perception.protocols import Detector, Stack
 from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.policies.lerobot import checkpoints
-from vap_core.policies.mini_pi0 import token_file
-from vap_core.policies.mini_pi0.learned_token import WORD
-from vap_core.policies.mini_pi0.teach_token import file_suffix, model_of, teach, teach_own
-from vap_core.policies.names import MINI as MINI
-from vap_core.policies.names import POLICIES as POLICIES
-from vap_core.policies.names import PRIVILEGED as PRIVILEGED
-from vap_core.policies.names import SHIPPED as SHIPPED
-from vap_core.policies.names import check_policy_name, checkpoint_of, label_of, shipped_checkpoint
-from vap_core.policies.protocol import Policy, PrivilegedPolicy
+from vap_core.policies.mini_pi0 import learned_token
+from vap_core.policies.mini_pi0.learned_token import WORD, file_suffix, model_of, teach, teach_own
+from vap_core.policies.protocol import MINI as MINI
+from vap_core.policies.protocol import POLICIES as POLICIES
+from vap_core.policies.protocol import PRIVILEGED as PRIVILEGED
+from vap_core.policies.protocol import SHIPPED as SHIPPED
+from vap_core.policies.protocol import (
+    Policy,
+    PrivilegedPolicy,
+    check_policy_name,
+    checkpoint_of,
+    label_of,
+    shipped_checkpoint,
+)
 from vap_core.policies.scripted.expert import Expert
-from vap_core.policies.scripted.random import Random
-from vap_core.policies.scripted.scripted import Scripted
+from vap_core.policies.scripted.scripted import Random, Scripted
+from vap_core.rollout.calls import check_policy
 from vap_core.rollout.loop import Follow, Trial, rollout
-from vap_core.rollout.policy_call import check_policy
-from vap_core.rollout.prompters.text import generic
+from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.env import Env
@@ -467,7 +469,7 @@ def _token_embedding(
     study: Study, method: str, row: EpisodeRow, bank: Path
 ) -> Float32[np.ndarray, " d"]:
     """The embedding that the target's word has under a method with a soft prompt."""
-    from vap_core.policies.mini_pi0.token_alignment import align
+    from vap_core.policies.mini_pi0.learned_token import align
     from vap_core.policies.mini_pi0.vlm import load_from_policy
 
     folder = checkpoints.locate(study.checkpoint(row.suite))
@@ -475,10 +477,12 @@ def _token_embedding(
     space = token_space(method)
     if space == "own":
         own = load_from_policy(folder).sha256()
-        suffix = file_suffix(rows, own, token_file.OWN_SUFFIX)
-        return token_file.load(bank, row.target, own, suffix).embedding
+        suffix = file_suffix(rows, own, learned_token.OWN_SUFFIX)
+        return learned_token.load(bank, row.target, own, suffix).embedding
     initialised_from = checkpoints.config_field(folder, "vlm")
-    token = token_file.load(bank, row.target, initialised_from, file_suffix(rows, initialised_from))
+    token = learned_token.load(
+        bank, row.target, initialised_from, file_suffix(rows, initialised_from)
+    )
     if space == "aligned":
         return align(token.embedding, model_of(initialised_from), folder)
     return token.embedding

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.tables import Rows, align
+from vap_core.base.files import Rows, align
 from vap_core.base.types import value
 from vap_core.perception.protocols import FamiliarityJudge, Stack, Thresholds
 from vap_core.study.stats import clustered_share

@@ -16,9 +16,8 @@ import numpy as np
 
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Boxes, Description, Mask, Rgb
-from vap_core.perception.attributes import CropAttributes, measure_crop
 from vap_core.perception.boxes import crop
-from vap_core.perception.describe import phrase_attributes
+from vap_core.perception.describe import CropAttributes, measure_crop, phrase_attributes
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.studio import Stage, reference_shots
 from vap_core.study.processes import results_here

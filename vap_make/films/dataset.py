@@ -28,8 +28,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, read_file, write_atomic, writing
-from vap_core.base.version import code_version
+from vap_core.base.files import code_version, parse_json, read_file, write_atomic, writing
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Suite, suite
 from vap_core.simulation.types import EE_ACTION

@@ -22,7 +22,7 @@ from vap_core.base.errors import BadOutput, OutOfReach
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.policies.scripted.expert import Expert, ExpertState
-from vap_core.rollout.expert_loop import expert_steps
+from vap_core.rollout.running import expert_steps
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene, build

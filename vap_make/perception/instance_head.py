@@ -16,7 +16,6 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.base.types import Rgb, value
 from vap_core.perception.boxes import crop
 from vap_core.perception.embedded.backbone import features, normalise
-from vap_core.perception.embedded.encode_network import InstanceHead, halve_b4
 from vap_core.perception.embedded.encoder import (
     HISTOGRAM_LENGTH,
     INSTANCE_SIDE,
@@ -25,10 +24,11 @@ from vap_core.perception.embedded.encoder import (
     lab_histogram,
     pad_to_square,
 )
-from vap_core.perception.embedded.taps import CHANNELS
+from vap_core.perception.embedded.networks import CHANNELS
 from vap_make.films.scenes import POSES, Shots, boxes_of
 from vap_make.perception.detector import augment, save_array
 from vap_make.perception.fitting import Run, fit, half_precision
+from vap_make.perception.graphs import InstanceHead, halve_b4
 from vap_make.perception.segmenter import jitter
 
 STAGES_PER_BATCH = 16

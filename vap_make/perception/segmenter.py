@@ -14,17 +14,11 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.perception.boxes import mask_box
 from vap_core.perception.embedded.backbone import load_backbone, normalise
-from vap_core.perception.embedded.mask_network import MaskHead
-from vap_core.perception.embedded.segmenter import (
-    SIDE,
-    TAPS,
-    box_plane,
-    cut,
-    window_around,
-)
+from vap_core.perception.embedded.segmenter import MASK_TAPS, SIDE, box_plane, cut, window_around
 from vap_make.films.scenes import Shots, boxes_of
 from vap_make.perception.detector import augment
 from vap_make.perception.fitting import Run, fit, half_precision
+from vap_make.perception.graphs import MaskHead
 
 BATCH = 16
 LEAST_PX = 80
@@ -133,7 +127,7 @@ def fit_segmenter(stages: Sequence[Shots], crops_per_epoch: int, run: Run) -> Ma
             pixels = normalise(rgb)
             with half_precision():
                 with torch.no_grad():
-                    taps = load_backbone()(pixels, TAPS)
+                    taps = load_backbone()(pixels, MASK_TAPS)
                 logits = head(pixels, taps, planes.float() / 255)
             yield mask_loss(logits.float(), masks.float() / 255)
 

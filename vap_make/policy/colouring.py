@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from vap_core.base.types import Colour, Description, value
-from vap_core.perception.colours import COLOURS
+from vap_core.perception.describe import COLOURS
 from vap_core.prompt import PALETTE
 from vap_make.recipe import Recipe
 from vap_make.words import PAINTS, similar_colours

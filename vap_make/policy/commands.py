@@ -20,7 +20,7 @@ from jaxtyping import Float32
 
 from vap_core.base.types import Description, value
 from vap_core.policies.mini_pi0.learned_token import WORD
-from vap_core.rollout.prompters.text import soft_prompt
+from vap_core.rollout.prompters import soft_prompt
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite

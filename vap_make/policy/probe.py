@@ -18,15 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import make_folder, write_atomic
-from vap_core.base.parquet import read_parquet
-from vap_core.base.tables import align
+from vap_core.base.files import align, make_folder, read_parquet, write_atomic
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.policies.lerobot import adapter as lerobot
-from vap_core.policies.names import label_of
+from vap_core.policies.protocol import label_of
 from vap_core.prompt import ALPHA, PALETTE
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters.protocol import PromptContext, unchanged
+from vap_core.rollout.prompters import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene

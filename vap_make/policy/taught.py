@@ -16,7 +16,7 @@ import numpy as np
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import parse_json, write_atomic, writing
 from vap_core.base.types import Rgb
-from vap_core.policies.mini_pi0 import learned_token, token_file
+from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.assets import objects
@@ -108,7 +108,7 @@ def learn_words(
     words = {}
     for name, accuracy in kept["accuracy"].items():
         if accuracy >= LEAST_ACCURACY:
-            words[name] = token_file.load(folder, name, model).embedding
+            words[name] = learned_token.load(folder, name, model).embedding
     return words, kept
 
 
@@ -133,7 +133,7 @@ def _learn(
     taught, unseen = (_photos(name, crew, seed) for seed in (0, 1))
     token = learned_token.learn(load_vlm(vlm), name, taught, unseen, training)
     with writing(folder, "train"):
-        token_file.save(folder, token)
+        learned_token.save(folder, token)
     return token.accuracy, time.process_time() - started
 
 

@@ -20,9 +20,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vap_core.base.device import device_name
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, device_name
 from vap_core.base.files import (
+    code_version,
     make_folder,
     parse_json,
     saving_tensors,
@@ -30,7 +30,6 @@ from vap_core.base.files import (
     write_atomic,
     writing,
 )
-from vap_core.base.version import code_version
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD, WORDS
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vap_core.base.errors import BadPolicy
-from vap_core.policies.hooks import observe_attention
 from vap_core.policies.lerobot.adapter import IMAGE, STATE, LeRobot, load_policy
-from vap_core.policies.protocol import Chunk, PolicyInput
+from vap_core.policies.protocol import Chunk, PolicyInput, observe_attention
 
 if TYPE_CHECKING:
     import pandas as pd

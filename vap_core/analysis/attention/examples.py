@@ -12,7 +12,7 @@ from vap_core.analysis.attention.pictures import run_again, strip
 from vap_core.analysis.plots import Tile
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import writing
-from vap_core.policies.hooks import AttentionMap, heat_map
+from vap_core.policies.protocol import AttentionMap, heat_map
 from vap_core.study.results import read_runs
 
 PARTS = ("suite", "task", "method", "episode")

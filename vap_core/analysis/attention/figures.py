@@ -6,8 +6,7 @@ import numpy as np
 
 from vap_core.analysis.attention.patterns import LOCALISATIONS, over_views
 from vap_core.analysis.attention.report import in_order
-from vap_core.base.figures import OTHER, WINNER, empty_figure
-from vap_core.base.palette import FRAME, TEXT
+from vap_core.base.pictures import FRAME, OTHER, TEXT, WINNER, empty_figure
 from vap_core.study.store import KEY
 
 if TYPE_CHECKING:

@@ -24,10 +24,9 @@ from vap_core.analysis.attention.measures import (
     measure,
     patch_areas,
 )
-from vap_core.policies.hooks import heat_map
 from vap_core.policies.lerobot.adapter import LeRobot
 from vap_core.policies.lerobot.attribution import gradient_maps, masking_maps
-from vap_core.policies.protocol import PolicyInput
+from vap_core.policies.protocol import PolicyInput, heat_map
 from vap_core.rollout.types import EpisodeHeader, Frame
 from vap_core.simulation.types import Outcome
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vap_core.analysis.attention.measures import BACKGROUND, LOOKALIKES, REGIONS, TARGET
-from vap_core.policies.hooks import ACTION
-from vap_core.rollout.queries import CATEGORY, COLOUR, TOKEN
+from vap_core.policies.protocol import ACTION
+from vap_core.rollout.calls import CATEGORY, COLOUR, TOKEN
 from vap_core.study.store import KEY
 
 if TYPE_CHECKING:

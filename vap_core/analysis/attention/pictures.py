@@ -21,12 +21,12 @@ from vap_core.analysis.attention.measures import (
 )
 from vap_core.analysis.attention.replay import check_policy
 from vap_core.analysis.plots import Tile, sheet
-from vap_core.base.palette import RIGHT_MARK, WRONG_MARK
+from vap_core.base.pictures import RIGHT_MARK, WRONG_MARK
 from vap_core.base.types import Mask, Rgb
-from vap_core.policies.hooks import heat_map
+from vap_core.policies.protocol import heat_map
 from vap_core.recording.entities.pictures import attention_overlay
+from vap_core.rollout.calls import QUERIES
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader, Frame
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views

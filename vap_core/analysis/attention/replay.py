@@ -14,8 +14,8 @@ from vap_core.analysis.attention import tables
 from vap_core.analysis.attention.observer import NOTHING, Observer, Rows
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import writing
+from vap_core.rollout.calls import QUERIES
 from vap_core.rollout.loop import rollout
-from vap_core.rollout.queries import QUERIES
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import store

@@ -14,7 +14,7 @@ from vap_core.analysis.attention.patterns import (
     with_localisation,
 )
 from vap_core.base.errors import BadStudy
-from vap_core.base.tables import align
+from vap_core.base.files import align
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study.stats import share
 from vap_core.study.store import KEY

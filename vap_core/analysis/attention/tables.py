@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import parse_json, write_atomic, writing
-from vap_core.base.parquet import read_parquet
-from vap_core.base.version import code_version
+from vap_core.base.files import code_version, parse_json, read_parquet, write_atomic, writing
 from vap_core.study import store
 
 if TYPE_CHECKING:

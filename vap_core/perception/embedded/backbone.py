@@ -14,15 +14,15 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from vap_core.base.types import Rgb
-from vap_core.perception.embedded.lite0 import (
+from vap_core.perception.embedded.networks import (
     BLOCKS,
+    GREY,
     HEAD,
     STEM,
     Block,
     Convolution,
     folded_weights,
 )
-from vap_core.perception.embedded.taps import GREY
 
 
 class _Residual(nn.Module):

@@ -10,11 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from vap_core.base.device import device_name
-from vap_core.base.extras import require
+from vap_core.base.errors import device_name, require
 from vap_core.perception.foundation.sources import EMBEDDED, parts_of
-from vap_core.perception.kept_thresholds import read_thresholds
-from vap_core.perception.protocols import Stack, Thresholds
+from vap_core.perception.protocols import Stack, Thresholds, read_thresholds
 
 
 def load(kind: str, device: str | None = None, store: Path | None = None) -> Stack:
@@ -49,7 +47,7 @@ def load_parts(name: str, device: str | None = None, store: Path | None = None) 
     """
     require("foundation", f"the stack {name}")
     from vap_core.perception.foundation import architectures
-    from vap_core.perception.foundation.runtime import select_runtime
+    from vap_core.perception.foundation.models import select_runtime
     from vap_core.perception.foundation.sources import models_of
     from vap_core.perception.foundation.store import verify_stack
 
@@ -76,8 +74,8 @@ def random_parts(name: str, device: str | None = None) -> dict[str, Any]:
         device.
     """
     require("foundation", f"the stack {name}")
-    from vap_core.perception.foundation import architectures, random_weights
-    from vap_core.perception.foundation.runtime import select_runtime
+    from vap_core.perception.foundation import architectures
+    from vap_core.perception.foundation.models import select_runtime
 
     runtime = select_runtime(device)
     filled: dict[str, Any] = {}
@@ -86,8 +84,8 @@ def random_parts(name: str, device: str | None = None) -> dict[str, Any]:
             continue
         filled |= architectures.fill_part(
             role=role,
-            network=random_weights.random_network(role, model),
-            tokenizer=random_weights.letter_tokenizer(),
+            network=architectures.random_network(role, model),
+            tokenizer=architectures.letter_tokenizer(),
             name=f"{model}-random",
             runtime=runtime,
         )

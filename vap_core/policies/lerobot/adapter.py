@@ -22,23 +22,27 @@ from jaxtyping import Float32
 
 from vap_core.base.errors import BadPolicy
 from vap_core.base.types import value
-from vap_core.policies.hooks import (
+from vap_core.policies.lerobot.checkpoints import PIPELINES, locate, stamp
+from vap_core.policies.lerobot.hooks import (
+    can_watch,
+    overriding_tokens,
+    positions,
+    reporting_attention,
+    word_width,
+)
+from vap_core.policies.lerobot.loading import EMPTY, build
+from vap_core.policies.lerobot.traced import ChunkPredictor
+from vap_core.policies.protocol import (
     TEXT,
+    Chunk,
+    PolicyInput,
     attention_observed,
     inputs_observed,
+    label_of,
     phrases_of,
     report_input,
+    state_sha256,
 )
-from vap_core.policies.lerobot.attention_hooks import can_watch, reporting_attention
-from vap_core.policies.lerobot.checkpoints import PIPELINES, locate, stamp
-from vap_core.policies.lerobot.loading import build
-from vap_core.policies.lerobot.module_hooks import overriding_tokens, word_width
-from vap_core.policies.lerobot.normalisation import EMPTY
-from vap_core.policies.lerobot.token_positions import positions
-from vap_core.policies.lerobot.traced import ChunkPredictor
-from vap_core.policies.names import label_of
-from vap_core.policies.protocol import Chunk, PolicyInput
-from vap_core.policies.weight_guard import state_sha256
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Suite

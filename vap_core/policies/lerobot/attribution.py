@@ -17,8 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from vap_core.policies.lerobot.adapter import LeRobot, LeRobotState
-from vap_core.policies.lerobot.attention_hooks import layout
-from vap_core.policies.lerobot.module_hooks import overriding_tokens
+from vap_core.policies.lerobot.hooks import layout, overriding_tokens
 from vap_core.policies.protocol import PolicyInput
 
 Map = Float32[np.ndarray, "rows columns"]

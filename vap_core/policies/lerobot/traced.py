@@ -28,7 +28,7 @@ import torch
 from torch.nn.modules import module as torch_module
 
 from vap_core.base.errors import first_line
-from vap_core.policies.hooks import attention_observed, inputs_observed
+from vap_core.policies.protocol import attention_observed, inputs_observed
 
 if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy

@@ -1,11 +1,6 @@
-"""The twin of an SO-101: a lerobot robot whose arm, desk and cameras are simulated.
+"""What lerobot's command line says about the twin of an SO-101, and about its expert.
 
-    lerobot-rollout --robot.type=vap_so101_twin --policy.path=... --task="select my cup" --fps=30
-
-Its features are those of lerobot's `so101_follower` with three cameras: `<joint>.pos` in degrees
-from the middle of the joint's range, `gripper.pos` 0 closed to 100 open; pictures are RGB, height x
-width x 3 bytes. So the command that drives the twin drives the arm, with `--robot.type` and its
-port changed. Time passes by 1 / 30 s with every action, however long that takes.
+lerobot finds the device of `NameConfig` as `Name` in the module of this name without `config_`.
 """
 
 import logging
@@ -15,10 +10,11 @@ from typing import Any
 
 import numpy as np
 from lerobot.robots import Robot
+from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators import Teleoperator
+from lerobot.teleoperators.config import TeleoperatorConfig
 
 from vap_core.base.errors import BadStudy, UnknownName
-from vap_core.policies.lerobot.config_twin import VapExpertConfig, VapSo101TwinConfig
 from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.simulation import robots, suites
 from vap_core.simulation.env import Env
@@ -26,6 +22,29 @@ from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Judge
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow, Outcome
+
+
+@RobotConfig.register_subclass("vap_so101_twin")
+@dataclass(kw_only=True)
+class VapSo101TwinConfig(RobotConfig):
+    """An SO-101 on the desk of a tabletop episode.
+
+    `task` is SUITE/TASK of a suite whose robot is an SO-101, `episode` the number of its row.
+    Pictures are `image_size` pixels a side. `object` takes the target's place, as in `rollout
+    --object`.
+    """
+
+    task: str = "tabletop/select-cup"
+    episode: int = 0
+    image_size: int = 224
+    object: str = ""
+
+
+@TeleoperatorConfig.register_subclass("vap_expert")
+@dataclass(kw_only=True)
+class VapExpertConfig(TeleoperatorConfig):
+    """The scripted expert, which reads the simulator, in place of a leader arm."""
+
 
 ROBOT = "so101"
 GRIPPER = "gripper"

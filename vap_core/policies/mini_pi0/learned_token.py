@@ -1,30 +1,113 @@
-"""The soft prompt: a new word for a personal object, learned in a frozen vision-language model.
+"""The learned word of a personal object: value, file, training and use (P appendix)."""
 
-It is learned by yes/no questions (SPEC section 4, P appendix).
-
-    token = learn(vlm, "red-mug", photos, unseen)
-    token.accuracy                                    # on photos that it never saw
-
-The question is "can you recognize <my_0> in this image", and only the embedding of <my_0> is
-trained. Photos of the actual distractors are its hard negatives, in the baseline's favour. The word
-is then given to the policy that was initialised from the model.
-"""
-
-from collections.abc import Iterator, Sequence
+import hashlib
+import struct
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 
-from vap_core.base.errors import BadMemory
+from vap_core.base.errors import BadMemory, BadStudy
+from vap_core.base.files import DATA, encode_tensors, parse_json, read_file, write_atomic, writing
 from vap_core.base.types import Rgb, value
-from vap_core.policies.mini_pi0.token_file import Token
+from vap_core.policies.lerobot.checkpoints import config_field
+from vap_core.policies.tables import check_width, open_table
+from vap_core.simulation.assets import objects
+from vap_core.simulation.studio import reference_views
+from vap_core.simulation.suites.open_row import models_of
+from vap_core.simulation.types import EpisodeRow
 
 if TYPE_CHECKING:
     import torch
 
     from vap_core.policies.mini_pi0.vlm import MiniVlm
+
+
+SUFFIX = ".token.safetensors"
+"""Of a word that was learned in the model that policies are initialised from."""
+OWN_SUFFIX = ".own.token.safetensors"
+"""Of a word that was learned in a policy's own weights."""
+
+
+@value
+class Token:
+    """A learned word: its embedding in the model's space, and its accuracy on held-out photos.
+
+    In `accuracy` positives and negatives have equal weight. `model` is the SHA-256 of the model in
+    which it was learned: it means nothing in another.
+    """
+
+    object: str
+    embedding: Float32[np.ndarray, " d"]
+    accuracy: float
+    model: str
+
+
+def save(folder: Path, token: Token, suffix: str = SUFFIX) -> Path:
+    """Write the object's name and `suffix`. Raises: OSError."""
+    header = {"object": token.object, "accuracy": repr(token.accuracy), "model": token.model}
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{token.object}{suffix}"
+    write_atomic(path, encode_tensors({"embedding": token.embedding}, header))
+    return path
+
+
+def load(folder: Path, name: str, model: str, suffix: str = SUFFIX) -> Token:
+    """The word of that object.
+
+    Raises: BadMemory when it is absent, damaged, of another object, or was learned in another
+        model.
+    """
+    from safetensors import SafetensorError
+
+    path = folder / f"{name}{suffix}"
+    try:
+        token = _read(path)
+    except (OSError, SafetensorError, struct.error, ValueError, KeyError, TypeError) as error:
+        raise BadMemory(
+            f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
+        ) from error
+    fault = _fault(token, name)
+    if fault:
+        raise BadMemory(f"tokens.load: {path} {fault}; learn it again.")
+    if token.model != model:
+        raise BadMemory(
+            f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; "
+            "learn it again."
+        )
+    return token
+
+
+def _fault(token: Token, name: str) -> str:
+    """What is wrong with the word of object `name`, "" where nothing is."""
+    if token.object != name:
+        return f"is the word of {token.object!r}, not of {name!r}"
+    if not np.isfinite(token.embedding).all():
+        return "has numbers that are not finite"
+    if not 0 <= token.accuracy <= 1:
+        return f"has an accuracy of {token.accuracy:g}, not from 0 to 1"
+    return ""
+
+
+def _read(path: Path) -> Token:
+    """The token in a file that `save` wrote."""
+    from safetensors.numpy import load as decode
+
+    data = read_file(path)
+    (length,) = struct.unpack("<Q", data[:8])
+    header = parse_json(data[8 : 8 + length])["__metadata__"]
+    return Token(
+        object=header["object"],
+        embedding=decode(data)["embedding"],
+        accuracy=float(header["accuracy"]),
+        model=header["model"],
+    )
+
 
 WORD = "<my_0>"
 QUESTION = "can you recognize <my_0> in this image"
@@ -251,3 +334,204 @@ def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
             torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
         )
     return torch.cat(resized)
+
+
+MODEL = DATA / "policies" / "mini-paligemma-tint-free"
+"""The shipped vision-language model that the default policies were initialised from.
+
+That of the first policies lies beside it in a clone (`model_of`).
+"""
+K = 5
+"""Photos of the object to learn from."""
+VIEWS = 12
+"""Photos of every look-alike (the paper: more than ten), and of the object to measure by."""
+OTHERS = 4
+"""The number of objects of other categories."""
+LEAST_ACCURACY = 0.95
+"""Share of right answers that the paper asks of a token."""
+
+
+def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
+    """Photos of the rows' target, of every look-alike beside it, and of other objects.
+
+    There are `k` of the target, as its owner takes them.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
+    rows = list(rows)
+    own = reference_views(objects.get_object(rows[0].target), k, seed)
+    rivals: list[Rgb] = []
+    for name in lookalikes(rows):
+        rivals += reference_views(objects.get_object(name), VIEWS, seed)
+    return Photos(tuple(own), tuple(rivals), other_objects(rows, seed))
+
+
+def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
+    """The objects of the target's category that the rows place beside it, sorted.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
+    rows = list(rows)
+    target = objects.get_object(rows[0].target)
+    names = []
+    for name in sorted(_placed(rows) - {target.name}):
+        if objects.get_object(name).category == target.category:
+            names.append(name)
+    return names
+
+
+def file_suffix(rows: Iterable[EpisodeRow], model: str, suffix: str = SUFFIX) -> str:
+    """What a token's file is called after its object's name: `suffix`, and before it a digest.
+
+    The digest is of what one object's tokens differ by: the SHA-256 of the model, and the
+    look-alikes beside the object.
+    """
+    differ_by = "\n".join([model, *lookalikes(rows)])
+    return f".{hashlib.sha256(differ_by.encode()).hexdigest()[:12]}{suffix}"
+
+
+def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
+    """Photos of personal objects of other categories than the rows' target.
+
+    Raises: UnknownName, BadObject, as `get_object`.
+    """
+    category = objects.get_object(rows[0].target).category
+    kinds = [kind for kind in objects.CATEGORIES if kind != category]
+    first = objects.CATEGORIES.index(category)
+    photos: list[Rgb] = []
+    for i in range(OTHERS):
+        other = objects.personal_instance(kinds[(first + 5 * i) % len(kinds)])
+        photos += reference_views(other, seed=seed)
+    return tuple(photos)
+
+
+def model_of(initialised_from: str) -> Path:
+    """The folder of the shipped model with this SHA-256; that of MODEL where none has it.
+
+    Raises: BadPolicy when a shipped model is damaged.
+    """
+    for folder in sorted(MODEL.parent.glob("mini-paligemma*")):
+        if _sha256(folder) == initialised_from:
+            return folder
+    return MODEL
+
+
+def model_of_policy(policy: Path) -> Path:
+    """The folder of the shipped model that the policy in a folder grew from. Raises: BadPolicy."""
+    return model_of(config_field(policy, "vlm"))
+
+
+@lru_cache
+def _sha256(model: Path) -> str:
+    """Of the model in a folder; every trial of a method asks for it."""
+    from vap_core.policies.mini_pi0.vlm import load_vlm
+
+    return load_vlm(model).sha256()
+
+
+def teach(
+    rows: Iterable[EpisodeRow], folder: Path, initialised_from: str, model: Path | None = None
+) -> Token:
+    """Learn the token of the rows' target from K photos, and keep it in `folder`.
+
+    It is measured on other photos. A token that is there already stays. `initialised_from` is the
+    SHA-256 of the model that the policy was initialised from; `model` is its folder, by default the
+    shipped one's. A token that is not learned well is noted on stderr.
+
+    Raises: BadPolicy without the model; BadStudy when the policy was initialised from another one;
+        BadOutput when the folder cannot be written.
+    """
+    from vap_core.policies.mini_pi0 import vlm
+
+    model = model or model_of(initialised_from)
+    teacher = vlm.load_vlm(model)
+    if teacher.sha256() != initialised_from:
+        known = f"mini-PaliGemma {initialised_from[:8]}" if initialised_from else "none"
+        raise BadStudy(
+            f"soft prompt: the policy was initialised from {known}, but the model in {model} is "
+            f"{teacher.sha256()[:8]}; leave soft out, or put the right one there."
+        )
+    return _teach(teacher, list(rows), folder, SUFFIX)
+
+
+def teach_own(rows: Iterable[EpisodeRow], folder: Path, policy: Path) -> Token:
+    """The same in the weights of the policy whose checkpoint is given, not in those it came from.
+
+    Raises: BadPolicy when the checkpoint is no mini-pi0; BadOutput when the folder cannot be
+        written.
+    """
+    from vap_core.policies.mini_pi0 import vlm
+
+    return _teach(vlm.load_from_policy(policy), list(rows), folder, OWN_SUFFIX)
+
+
+def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix: str) -> Token:
+    """Learn the target's token in `teacher` unless the folder has it."""
+    from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
+
+    name = rows[0].target
+    suffix = file_suffix(rows, teacher.sha256(), suffix)
+    if (folder / f"{name}{suffix}").exists():
+        return load(folder, name, teacher.sha256(), suffix)
+    taught = photographs(rows, 0, K)
+    unseen = photographs(rows, 1, VIEWS)
+    with fused_attention():  # a third less time
+        token = learn(teacher, name, taught, unseen)
+    if token.accuracy < LEAST_ACCURACY:
+        print(
+            f"note: the learned token of {name} is right in {100 * token.accuracy:.0f} % of unseen "
+            f"photos, less than {100 * LEAST_ACCURACY:.0f} %.",
+            file=sys.stderr,
+        )
+    with writing(folder, "tokens"):
+        save(folder, token, suffix)
+    return token
+
+
+def _placed(rows: Sequence[EpisodeRow]) -> set[str]:
+    """The objects that the rows place, without the goals."""
+    return set(models_of(rows)) - {row.goal for row in rows}
+
+
+PRIOR = 1e-3
+"""Weight of the identity, in squared lengths of a mean row.
+
+It decides only what the words leave open: a small vocabulary has fewer words than features.
+"""
+
+
+def orthogonal_map(
+    source: Float32[np.ndarray, "v d"], target: Float32[np.ndarray, "v d"]
+) -> Float64[np.ndarray, "d d"]:
+    """The orthogonal R for which source @ R is nearest to target (Procrustes)."""
+    from scipy.linalg import orthogonal_procrustes
+
+    width = source.shape[1]
+    mean_square = np.square(source, dtype=np.float64).sum() / len(source)
+    identity = np.sqrt(PRIOR * mean_square / width) * np.eye(width)
+    rotation, _ = orthogonal_procrustes(
+        np.concatenate([source, identity]), np.concatenate([target, identity])
+    )
+    return rotation
+
+
+def align(
+    embedding: Float32[np.ndarray, " d"], model: Path, policy: Path
+) -> Float32[np.ndarray, " d"]:
+    """The embedding, learned in `model`, rotated into the space of the policy; both are folders.
+
+    Raises: BadPolicy.
+    """
+    check_width(open_table(model), len(embedding), "the embedding")
+    source, target = shared_tables(model, policy)
+    return (embedding @ orthogonal_map(source, target)).astype(np.float32)
+
+
+def shared_tables(
+    model: Path, policy: Path
+) -> tuple[Float32[np.ndarray, "v d"], Float32[np.ndarray, "v d"]]:
+    """The two tables over the tokens that both have. Raises: BadPolicy."""
+    tables = open_table(model), open_table(policy)
+    check_width(tables[1], tables[0].shape[1], str(model))
+    n = min(table.shape[0] for table in tables)
+    return tables[0].block(0, n), tables[1].block(0, n)

@@ -18,7 +18,7 @@ from vap_core.base.files import write_atomic
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniTowers
 from vap_core.policies.mini_pi0.processor_mini_pi0 import END, encode, vocabulary
-from vap_core.policies.weight_guard import state_sha256
+from vap_core.policies.protocol import state_sha256
 
 ANSWER = 3
 """Words of the longest answer, END included."""

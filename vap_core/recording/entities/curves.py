@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from vap_core.base.palette import Rgb8
+from vap_core.base.pictures import Rgb8
 from vap_core.base.types import Event
 from vap_core.recording.colours import (
     CAMERAS,
@@ -22,8 +22,7 @@ from vap_core.recording.colours import (
 )
 from vap_core.recording.entities.scene import nearest_other_m
 from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
-from vap_core.rollout.failure import Diagnosis, EpisodeTrace
-from vap_core.rollout.types import EpisodeHeader, Frame
+from vap_core.rollout.types import Diagnosis, EpisodeHeader, EpisodeTrace, Frame
 from vap_core.simulation.types import EpisodeRow
 
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")

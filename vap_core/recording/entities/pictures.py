@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.types import Camera, Mask, Rgb
-from vap_core.policies.hooks import heat_map
+from vap_core.policies.protocol import heat_map
 from vap_core.recording.colours import ELECTED, TARGET, image_root, object_colours, target_suffix
 from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
 from vap_core.rollout.types import EpisodeHeader, Frame

@@ -7,9 +7,8 @@ import numpy as np
 import rerun as rr
 
 from vap_core.base.events import describe_ballot
-from vap_core.base.palette import RIGHT_MARK, WRONG_MARK, Rgb8
+from vap_core.base.pictures import RIGHT_MARK, WRONG_MARK, Rgb8, vote_picture
 from vap_core.base.types import Association, Grounding, Rgb
-from vap_core.base.vote_picture import vote_picture
 from vap_core.recording.colours import ELECTED, MUTED, image_root, target_suffix
 from vap_core.recording.entities.pictures import encode_jpeg, jpeg_image
 from vap_core.recording.stream import log_row

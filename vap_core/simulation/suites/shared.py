@@ -20,7 +20,7 @@ from itertools import permutations
 import numpy as np
 
 from vap_core.base.types import value
-from vap_core.instruction.sequence import decompose
+from vap_core.instruction.expressions import decompose
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import simpler, tabletop
 from vap_core.simulation.suites.layout import (

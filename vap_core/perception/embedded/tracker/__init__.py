@@ -8,12 +8,15 @@ decides which masks are believed, `search` looks for lost identities, and `track
 from functools import cache
 
 from vap_core.perception.embedded.encoder import load as load_encoder
-from vap_core.perception.embedded.lite0 import trunk_weights
-from vap_core.perception.embedded.runtime import load_network
+from vap_core.perception.embedded.networks import (
+    PERCEPTION,
+    load_network,
+    read_manifest,
+    trunk_weights,
+)
 from vap_core.perception.embedded.segmenter import load as load_segmenter
 from vap_core.perception.embedded.tracker.cells import GRAPH, TAP
 from vap_core.perception.embedded.tracker.tracker import LiteTracker
-from vap_core.perception.embedded.weights import PERCEPTION, read_manifest
 
 
 @cache

@@ -18,26 +18,28 @@ from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Mask, Rgb, Track
 from vap_core.perception.boxes import mask_box
-from vap_core.perception.embedded.runtime import Network
+from vap_core.perception.embedded.networks import Network
 from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.perception.embedded.tracker.cells import (
     Labels,
+    argmax_planes,
     cells_near,
     embed_cells,
+    nearest_component,
     propagate,
     to_pixels,
 )
-from vap_core.perception.embedded.tracker.components import argmax_planes, nearest_component
-from vap_core.perception.embedded.tracker.search import is_due, search
-from vap_core.perception.embedded.tracker.state import (
+from vap_core.perception.embedded.tracker.identities import (
     FrameFeatures,
     TrackState,
     changed_nearby,
     initial_state,
+    is_due,
+    search,
     thumbnail_of,
     tracks_of,
+    update_state,
 )
-from vap_core.perception.embedded.tracker.update import update_state
 from vap_core.perception.protocols import Encoder
 
 FIRST_FRAME_WEIGHT = 0.4

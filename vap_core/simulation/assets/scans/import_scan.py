@@ -17,8 +17,7 @@ from typing import Literal
 import numpy as np
 
 from vap_core import __version__
-from vap_core.base.errors import BadObject
-from vap_core.base.limits import bounded
+from vap_core.base.errors import BadObject, bounded
 from vap_core.memory import NAME, NAME_RULE, kind_instead, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects

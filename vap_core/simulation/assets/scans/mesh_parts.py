@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from vap_core.base.errors import BadObject
-from vap_core.base.photos import MAX_PIXELS, PICTURE_FORMATS
+from vap_core.base.media import MAX_PIXELS, PICTURE_FORMATS
 
 if TYPE_CHECKING:
     import trimesh

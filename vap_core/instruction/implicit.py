@@ -1,29 +1,139 @@
-"""Which object one expression of an instruction means.
-
-What it says is evidence in this order: the owner, earlier uses ("the one I used earlier"), the
-category, what is excluded ("not the striped one"), and what the rest of the words mean.
-"""
+"""Implicit references: which object a description means, by looks and use (P appendix)."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadInstruction, UnknownName
-from vap_core.base.types import PersonalObject
-from vap_core.instruction.context import Context
+from vap_core.base.errors import BadInstruction, UnknownName, VapError
+from vap_core.base.types import Instruction, PersonalObject, Target
+from vap_core.instruction.context import MINE, OTHERS, Context, belonging, find_owner, fold
 from vap_core.instruction.expressions import (
     Exclusion,
     Expression,
+    Possession,
     content,
     find_category,
+    find_exclusions,
+    find_expressions,
     person_pattern,
 )
-from vap_core.instruction.meaning import EmbedText, object_scores
-from vap_core.instruction.owners import MINE, OTHERS, belonging, find_owner, fold
-from vap_core.instruction.possession import Possession
+from vap_core.instruction.rule import check_length, is_name
+
+SYNONYMS = {
+    "striped": ("stripes", "bands"),
+    "stripe": ("stripes", "bands"),
+    "banded": ("bands", "stripes"),
+    "band": ("bands", "stripes"),
+    "spotted": ("spots",),
+    "dotted": ("spots",),
+    "dot": ("spots",),
+    "dots": ("spots",),
+    "speckled": ("spots",),
+    "patched": ("patches",),
+    "light": ("light", "white", "beige"),
+    "lighter": ("light", "white", "beige"),
+    "darker": ("dark",),
+    "gray": ("grey",),
+}
+"""Words for patterns and shades, in the captioner's vocabulary."""
+MAIN = 1.0
+"""Weight of a word of the main colour, of the other prominent parts, and of the rest."""
+PROMINENT = 0.6
+MINOR = 0.2
+PAIR = 1.0
+"""Weight of two neighbouring words that are neighbours in the description: "black bands"."""
+NONE = re.compile(r"\b(?:without|no|nothing|non)\b")
+
+
+def fit(words: str, obj: PersonalObject) -> float:
+    """How well words such as "striped" or "with black bands" fit an object; 0 where none does.
+
+    What follows "without" or "no" counts against it.
+    """
+    if obj.description is None:
+        return 0.0
+    there, _, absent = _split_none(words.lower())
+    total = 0.0
+    for part, sign in ((there, 1.0), (absent, -1.0)):
+        total += sign * _fit(part, obj.description.short.lower(), obj.description.long.lower())
+    return total
+
+
+def wanted(words: str) -> str:
+    """The words before "without", "no" or "non-": what follows is not there."""
+    return _split_none(words.lower())[0].strip()
+
+
+def _split_none(words: str) -> tuple[str, str, str]:
+    match = NONE.search(words)
+    if match is None:
+        return words, "", ""
+    return words[: match.start()], match.group(), words[match.end() :]
+
+
+def _fit(words: str, short: str, long: str) -> float:
+    main = short.split(" with ")[0].split()
+    prominent = short.split()
+    minor = re.findall(r"[\w-]+", long)
+    total = 0.0
+    said = re.findall(r"\w[\w-]*", words)
+    for i, word in enumerate(said):
+        weights = [0.0]
+        for same in (word, *SYNONYMS.get(word, ()), word.rstrip("s")):
+            if same in main:
+                weights.append(MAIN)
+            if same in prominent:
+                weights.append(PROMINENT)
+            if same in minor or f"{same}es" in minor or f"{same}s" in minor:
+                weights.append(MINOR)
+        total += max(weights)
+        if i and weights[1:]:
+            for same in (word, *SYNONYMS.get(word, ())):
+                if f"{said[i - 1]} {same}" in short:
+                    total += PAIR
+                    break
+    if words.strip() in ("plain", "all black", "plain one"):
+        total += float("plain" in minor or " with " not in short)
+    return total
+
+
+EmbedText = Callable[[Sequence[str]], Float32[np.ndarray, "n d"]]
+LOOKS = 0.25
+"""Weight of the description's words beside the cosine."""
+
+
+def object_scores(
+    words: str, objects: Sequence[PersonalObject], embed: EmbedText, *, looks: bool
+) -> Float32[np.ndarray, " n"]:
+    """How well words fit every object.
+
+    It is the mean of the two greatest cosines with the object's texts, and the fit of its
+    description; among objects of one category, whose `looks` differ, the greatest cosine.
+    """
+    there = wanted(words) if looks else words
+    (query,) = embed([there or words])
+    scores = np.zeros(len(objects), np.float32)
+    for i, obj in enumerate(objects):
+        cosines = np.sort(embed(_texts(obj, looks)) @ query)
+        cosine = cosines[-1] if looks else cosines[-2:].mean()
+        if not there:
+            cosine = 0.0
+        scores[i] = float(cosine) + LOOKS * fit(words, obj)
+    return scores
+
+
+def _texts(obj: PersonalObject, looks: bool) -> list[str]:
+    """What is known of an object, in phrases."""
+    texts = [obj.category]
+    if obj.note:
+        texts += [obj.note, f"{obj.category} {obj.note}", f"something {obj.note}"]
+    if looks and obj.description is not None:
+        texts.append(f"{obj.category}, {obj.description.short}")
+    return texts
+
 
 PURPOSE = 0.3
 """Least cosine of words without a category with the object that they mean."""
@@ -304,4 +414,91 @@ def _ambiguous(expression: Expression, objects: Sequence[PersonalObject]) -> Bad
     return BadInstruction(
         f"parse: {expression.said[:60]!r} could be {names}; say whose it is, what it looks like or "
         "what it is for."
+    )
+
+
+@dataclass(frozen=True)
+class EmbeddingParser:
+    """Finds the object that every expression means, by its name in the memory."""
+
+    context: Context
+    embed: EmbedText
+
+    def __call__(self, text: str, categories: Collection[str] = ()) -> Instruction:
+        """Parse one instruction; every target names its object.
+
+        Raises: BadInstruction: no personal object, or several fit, or the text is too long;
+            UnknownName: none is remembered; MissingWeights: `embed` has no weights here.
+        """
+        check_length(text)
+        exclusions = find_exclusions(text)
+        found: list[tuple[Expression, PersonalObject]] = []
+        problem: VapError | None = None
+        unmet: VapError | None = None
+        people = person_pattern(self.context)
+        expressions = list(find_expressions(text, exclusions, people))
+        last = 0
+        for expression in expressions:
+            if expression.start < last:
+                continue
+            try:
+                obj = Reading(
+                    context=self.context,
+                    embed=self.embed,
+                    text=text,
+                    expression=expression,
+                    expressions=expressions,
+                    exclusions=exclusions,
+                ).object()
+            except VapError as error:
+                if problem is None or expression.governed:
+                    problem = error
+                if expression.kind == "owner" and self._is_wanted(expression):
+                    unmet = unmet or error
+                continue
+            if obj is not None:
+                found.append((expression, obj))
+                last = max(last, expression.stop)
+        targets = _targets(found)
+        if targets and unmet is None:
+            return Instruction(text, targets)
+        nothing = BadInstruction(
+            f'parse: no personal object in {text[:80]!r}; name one as "my <category>", or say what '
+            "it is for."
+        )
+        raise unmet or problem or nothing
+
+    def _is_wanted(self, expression: Expression) -> bool:
+        """Whether the instruction cannot be followed without the object."""
+        known = {obj.category for obj in self.context.objects.values()}
+        named = find_category(expression.said, known) is not None
+        return expression.argument or (expression.destination and named)
+
+
+def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:
+    """One target per object: where a verb of action or a place is, only those that stand there.
+
+    Wherever else the object is named again, as "my cup", that is a span of its target, too.
+    """
+    governed = [pair for pair in found if pair[0].governed]
+    targets: dict[str, Target] = {}
+    for expression, obj in governed or found:
+        targets.setdefault(obj.name, _target(expression, obj))
+    for expression, obj in found:
+        target = targets.get(obj.name)
+        if target is None or target.start == expression.start:
+            continue
+        if is_name(expression.said, obj.category):
+            again = (*target.again, _target(expression, obj))
+            targets[obj.name] = replace(target, again=again)
+    return tuple(targets.values())
+
+
+def _target(expression: Expression, obj: PersonalObject) -> Target:
+    return Target(
+        start=expression.start,
+        stop=expression.stop,
+        owner=obj.owner,
+        category=obj.category,
+        object=obj.name,
     )

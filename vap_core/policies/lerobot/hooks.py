@@ -1,11 +1,6 @@
-"""Where a pi0, pi0.5, mini-pi0 or SmolVLA looks, read while it is called.
+"""Where the phrases of an instruction stand among its tokens."""
 
-Words of the instruction are queries in the layers of the vision-language model, the action expert's
-tokens in its own layers; keys are the image patches of every view. What is set on the policy is
-removed when the call ends.
-"""
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -14,8 +9,92 @@ import torch
 from jaxtyping import Bool, Float
 
 from vap_core.base.types import value
-from vap_core.policies.hooks import ACTION, AttentionMap, report_attention
-from vap_core.policies.lerobot.token_positions import Positions
+from vap_core.policies.protocol import ACTION, AttentionMap, Phrases, report_attention
+
+Positions = dict[str, list[int]]
+"""The places of every query's tokens, by query."""
+
+
+def positions(preprocessor: Any, tokens: torch.Tensor, phrases: Phrases) -> Positions:
+    """The places of every query's phrases in one row of tokens; a query that is not there is out.
+
+    `preprocessor` is the policy's, which has the tokenizer.
+    """
+    row = tokens.tolist()
+    found: Positions = {}
+    for query, alternatives in phrases.items():
+        places: set[int] = set()
+        for phrase in alternatives:
+            for spelled in _spellings(preprocessor, phrase):
+                places.update(_occurrences(row, spelled))
+        if places:
+            found[query] = sorted(places)
+    return found
+
+
+def _occurrences(row: Sequence[int], spelled: Sequence[int]) -> set[int]:
+    """The places of every token of every occurrence of `spelled` in `row`."""
+    width = len(spelled)
+    places: set[int] = set()
+    for start in range(len(row) - width + 1):
+        if list(row[start : start + width]) == list(spelled):
+            places.update(range(start, start + width))
+    return places
+
+
+def _spellings(preprocessor: Any, phrase: str) -> list[list[int]]:
+    """The tokens of a phrase, at the beginning of a text and after a blank.
+
+    A phrase that the vocabulary lacks has none.
+    """
+    from vap_core.policies.mini_pi0.processor_mini_pi0 import SPLIT, UNKNOWN, Words  # lerobot's
+
+    for step in preprocessor.steps:
+        if isinstance(step, Words):
+            known = step._vocabulary
+            spelled = [known.get(word, known[UNKNOWN]) for word in SPLIT.findall(phrase.lower())]
+            return [] if known[UNKNOWN] in spelled else [spelled]
+        tokenizer = getattr(step, "input_tokenizer", None)
+        if tokenizer is not None:
+            spellings = []
+            for text in (phrase, f" {phrase}"):
+                spelled = list(tokenizer.encode(text, add_special_tokens=False))
+                known_all = tokenizer.unk_token_id not in spelled
+                if spelled and known_all and spelled not in spellings:
+                    spellings.append(spelled)
+            return spellings
+    return []
+
+
+def word_width(policy: Any) -> int:
+    """How many numbers the embedding of a word of a pi0 has."""
+    return int(_words(policy).weight.shape[1])
+
+
+@contextmanager
+def overriding_tokens(policy: Any, learned: Mapping[int, torch.Tensor]) -> Iterator[None]:
+    """Inside, the embeddings of learned words are the learned ones, by their tokens."""
+    if not learned:
+        yield
+        return
+
+    def replace_embeddings(module: Any, args: Any, embeddings: torch.Tensor) -> torch.Tensor:
+        for token, embedding in learned.items():
+            is_token = (args[0] == token)[..., None]
+            embeddings = torch.where(is_token, embedding.to(embeddings), embeddings)
+        return embeddings
+
+    hook = _words(policy).register_forward_hook(replace_embeddings)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+def _words(policy: Any) -> torch.nn.Embedding:
+    """The table of words of a pi0."""
+    return policy.model.paligemma_with_expert.paligemma.model.language_model.embed_tokens
+
 
 Weights = Float[torch.Tensor, "b heads queries keys"]
 MARKS = 3

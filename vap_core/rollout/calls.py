@@ -1,16 +1,30 @@
-"""One call of a policy: it may take a limited time, and what it returns is checked."""
+"""Calls of a policy: faults with their remedy, attention queries, and the audit of its inputs."""
 
+import copy
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadPolicy, BadStudy
+from vap_core.base.errors import BadPolicy, BadStudy, one_of
+from vap_core.policies.mini_pi0.learned_token import WORD
+from vap_core.policies.protocol import (
+    ACTION,
+    TEXT,
+    AttentionMap,
+    Phrases,
+    Policy,
+    PolicyInput,
+    observe_inputs,
+)
+from vap_core.prompt import PALETTE
+from vap_core.rollout.types import ConsumedInput
+from vap_core.simulation.types import EpisodeRow
 
 NOTE_AFTER_S = 60.0
 """A call that takes longer is noted on stderr, with the episodes that wait for it."""
@@ -154,3 +168,99 @@ def _note_waiting(episodes: Sequence[str]) -> None:
         file=sys.stderr,
         flush=True,
     )
+
+
+TOKEN = "token"
+COLOUR = "colour"
+CATEGORY = "category"
+QUERIES = (TOKEN, COLOUR, CATEGORY, ACTION)
+ALL = "all"
+
+
+def query_phrases(row: EpisodeRow) -> Phrases:
+    """The words of every query in one episode; a text that lacks them has no such query."""
+    colours = tuple(colour.name for colour in PALETTE)
+    return {TOKEN: (WORD,), COLOUR: colours, CATEGORY: (row.category,)}
+
+
+def only_queries(
+    maps: Mapping[str, Mapping[str, AttentionMap]], wanted: Sequence[str]
+) -> dict[str, dict[str, AttentionMap]]:
+    """The maps of the wanted queries, by camera; empty where the text has none of them."""
+    kept: dict[str, dict[str, AttentionMap]] = {}
+    for camera, of_queries in maps.items():
+        for query, heat in of_queries.items():
+            if query in wanted:
+                kept.setdefault(camera, {})[query] = heat
+    return kept
+
+
+def named_queries(names: Sequence[str]) -> tuple[str, ...]:
+    """The queries that are named, in the order of QUERIES; "all" names every one.
+
+    Raises: UnknownName.
+    """
+    for name in names:
+        if name not in (*QUERIES, ALL):
+            raise one_of("--attention: query", name, [*QUERIES, ALL])
+    if ALL in names:
+        return QUERIES
+    return tuple(query for query in QUERIES if query in names)
+
+
+Digests = tuple[Mapping[str, str], Mapping[str, str]]
+"""By camera or TEXT: digests of what was consumed of the prompted, and of the raw input."""
+
+
+def plan(
+    policy: Policy[Any],
+    states: Sequence[Any],
+    prompted: Sequence[PolicyInput],
+    raw: Sequence[PolicyInput],
+) -> tuple[list[Any], list[Any], list[Digests]]:
+    """The policy's chunks for the prompted inputs, and what it consumed in each episode.
+
+    Raises: BadPolicy when the policy reports nothing.
+    """
+    spare = copy.deepcopy(list(states))
+    with observe_inputs() as of_prompted:
+        returned = policy.plan(states, prompted)
+        after, chunks = checked_plan(returned, policy.label, len(states))
+    chunks = copy.deepcopy(chunks)  # the second call may write into the same arrays
+    with observe_inputs() as of_raw:
+        policy.plan(spare, raw)
+    if len(of_prompted) != len(prompted):
+        raise BadPolicy(
+            f"audit: {policy.label} does not report what it consumes; call "
+            "vap_core.policies.protocol.report_input where it uses its inputs."
+        )
+    digests: list[Digests] = []
+    for i in range(len(prompted)):
+        digests.append((of_prompted[i], of_raw[i]))
+    return after, chunks, digests
+
+
+def compare(
+    step: int, prompted: PolicyInput, raw: PolicyInput, digests: Digests
+) -> list[ConsumedInput]:
+    """What one episode consumed in one call; views that the policy does not read are left out."""
+    of_prompted, of_raw = digests
+    found = []
+    for name, digest in of_prompted.items():
+        if name == TEXT:
+            pixels = 0
+            changed = prompted.text != raw.text
+        else:
+            differs = (prompted.images[name] != raw.images[name]).any(axis=2)
+            pixels = int(differs.sum())
+            changed = bool(differs.any())
+        consumed = ConsumedInput(
+            step=step,
+            name=name,
+            changed=changed,
+            pixels=pixels,
+            consumed=digest,
+            raw=of_raw[name],
+        )
+        found.append(consumed)
+    return found

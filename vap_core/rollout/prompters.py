@@ -1,0 +1,492 @@
+"""What a prompter is, and the prompters: it decides what the frozen policy receives."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+
+from vap_core.associate import overrule
+from vap_core.attend import Attender, AttendState, Prompting
+from vap_core.base.errors import BadInstruction, BadMemory, BadStudy
+from vap_core.base.types import (
+    Attended,
+    Boxes,
+    Camera,
+    Event,
+    Grounding,
+    Mask,
+    PersonalObject,
+    Rgb,
+    Track,
+    Views,
+    value,
+)
+from vap_core.instruction import parse
+from vap_core.perception.boxes import crop, mask_box
+from vap_core.perception.candidates import Candidates
+from vap_core.simulation.types import EpisodeRow, Observation
+
+Masks = Mapping[str, Mapping[str, Mask]]
+"""`masks[camera][object]`: visible pixels, as in simulation.types.Truth."""
+
+
+@value
+class SceneTruth:
+    """Ground truth of one step, for prompters that declare `needs_truth`.
+
+    `step` counts the control steps that were taken, `moved` names the objects that moved so far
+    (simulation.suites.rules).
+    """
+
+    row: EpisodeRow
+    masks: Masks
+    step: int = 0
+    moved: frozenset[str] = frozenset()
+
+
+@value
+class PromptContext:
+    """What a prompter knows besides the observation.
+
+    `cameras` are the calibrated cameras at this moment, by name. `truth` is there only for a
+    prompter that declares it.
+    """
+
+    instruction: str
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    truth: SceneTruth | None = None
+
+
+@runtime_checkable
+class Prompter[S](Protocol):
+    """Turns observations into what the policy sees and reads.
+
+    What one episode carries is state, an argument and a result. `needs_truth` says when it reads
+    the simulator: "never", at the "start", or "always"; one that does is a bound on results, never
+    a result. `highlights` says whether it changes pixels inside tracked masks, so that the masks'
+    coverage is recorded. `references` are the remembered crops of its objects, by name, for
+    recordings.
+    """
+
+    needs_truth: Literal["never", "start", "always"]
+
+    @property
+    def highlights(self) -> bool: ...
+
+    @property
+    def references(self) -> Mapping[str, tuple[Rgb, ...]]: ...
+
+    def start(self, observation: Observation, context: PromptContext) -> tuple[S, Attended]:
+        """The first step of an episode."""
+        ...
+
+    def steps(
+        self,
+        states: Sequence[S],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[S, Attended]]:
+        """The next step of every episode of a batch.
+
+        The result for one does not depend on the others.
+        """
+        ...
+
+
+def checked_steps(returned: object, prompter: object, n: int) -> list[tuple[Any, Attended]]:
+    """What `steps` of a prompter returned for `n` episodes.
+
+    Raises: ValueError when it is not a list of one state and one Attended for each episode.
+    """
+    who = f"prompter {type(prompter).__name__}: steps returned"
+    if not isinstance(returned, list | tuple):
+        raise ValueError(f"{who} {type(returned).__name__}; return a list, one result per episode")
+    if len(returned) != n:
+        episodes = "1 episode" if n == 1 else f"{n} episodes"
+        raise ValueError(f"{who} {len(returned)} results for {episodes}; return one for each")
+    for result in returned:
+        is_pair = isinstance(result, list | tuple) and len(result) == 2
+        if not is_pair or not isinstance(result[1], Attended):
+            raise ValueError(
+                f"{who} {type(result).__name__} as a result; return the state and an Attended"
+            )
+    return [(state, attended) for state, attended in returned]
+
+
+def unchanged(images: Views, text: str) -> Attended:
+    """Images as they are, with `text`."""
+    return Attended(
+        images=images, text=text, colours=(), tracks={}, groundings={}, events=(), associations=()
+    )
+
+
+@dataclass(frozen=True)
+class HardPrompt:
+    """The object's description, short or long, is appended to the instruction."""
+
+    length: Literal["short", "long"]
+
+
+@dataclass(frozen=True)
+class SoftPrompt:
+    """The personal span is replaced by a reserved, learned word (SPEC section 4).
+
+    It is learned in the model that the policy was initialised from and copied, as the paper does;
+    learned there and rotated into the policy's space; or learned in the policy's own weights.
+    """
+
+    space: Literal["copied", "aligned", "own"] = "copied"
+
+
+@dataclass(frozen=True)
+class OtherCommand:
+    """The policy reads another command than the episode's.
+
+    None at all, or that of the suite's next task.
+    """
+
+    command: Literal["blank", "next task"]
+
+
+class TextPrompter:
+    """Passes images unchanged; the policy reads `rewrite(instruction)` in every step."""
+
+    needs_truth: Literal["never", "start", "always"] = "never"
+    highlights = False
+    references: Mapping[str, tuple[Rgb, ...]] = MappingProxyType({})
+
+    def __init__(self, rewrite: Callable[[str], str]) -> None:
+        self.rewrite = rewrite
+
+    def start(self, observation: Observation, context: PromptContext) -> tuple[str, Attended]:
+        """The state of an episode is its text."""
+        text = self.rewrite(context.instruction)
+        return text, unchanged(observation.images, text)
+
+    def steps(
+        self,
+        states: Sequence[str],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[str, Attended]]:
+        results = []
+        for text, observation in zip(states, observations, strict=True):
+            results.append((text, unchanged(observation.images, text)))
+        return results
+
+
+def generic() -> TextPrompter:
+    """The generic policy: raw images, raw instruction."""
+    return TextPrompter(str)
+
+
+def say(text: str) -> TextPrompter:
+    """Raw images and `text`, whatever the instruction is."""
+
+    def replace_all(instruction: str) -> str:
+        return text
+
+    return TextPrompter(replace_all)
+
+
+def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
+    """The object's description is appended to the instruction.
+
+    "pick up my cup" -> "pick up my cup. My cup is white with blue spots."
+
+    Raises: BadMemory when the object was never described.
+    """
+    if obj.description is None:
+        raise BadMemory(
+            f"hard_prompt: {obj.name!r} has no description; register it again with --replace, or "
+            "delete its file."
+        )
+    phrase = obj.description.short if how.length == "short" else obj.description.long
+
+    def append(instruction: str) -> str:
+        return f"{instruction.rstrip(' .')}. My {obj.category} is {phrase}."
+
+    return TextPrompter(append)
+
+
+def soft_prompt(word: str, categories: Collection[str] = ()) -> TextPrompter:
+    """The personal span is replaced: "pick up my cup" -> "pick up <my_0>" for `word` "<my_0>".
+
+    With the objects' `categories` it is the span that the method replaces; without, it is all words
+    up to the first stop word.
+    """
+
+    def replace_span(instruction: str) -> str:
+        target = parse(instruction, categories).targets[0]
+        return instruction[: target.start] + word + instruction[target.stop :]
+
+    return TextPrompter(replace_span)
+
+
+class TintPrompter:
+    """Grounds, tracks and tints by an `Attender`; it reads nothing of the simulator."""
+
+    needs_truth: Literal["never", "start", "always"] = "never"
+
+    def __init__(self, attender: Attender) -> None:
+        self.attender = attender
+
+    @property
+    def highlights(self) -> bool:
+        return self.attender.prompting.highlight
+
+    @property
+    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
+        return self.attender.references
+
+    def start(
+        self, observation: Observation, context: PromptContext
+    ) -> tuple[AttendState, Attended]:
+        return self.attender.start(observation.images, context.instruction, cameras=context.cameras)
+
+    def steps(
+        self,
+        states: Sequence[AttendState],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[AttendState, Attended]]:
+        views = [observation.images for observation in observations]
+        return self.attender.steps(states, views)
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Which stage is replaced by ground truth.
+
+    "box": the boxes and the choice among them, then segment and track. "mask": the masks at t = 0,
+    then track. "track": the mask at every step. `of` is the object that is prompted: the target, or
+    the first look-alike that the episode places. With "track" the mask may be wrong on purpose: of
+    `area` times its pixels, about its middle, and moved by `shift` times its width.
+    """
+
+    reveal: Literal["box", "mask", "track"]
+    of: Literal["target", "look-alike"] = "target"
+    area: float = 1.0
+    shift: float = 0.0
+    prompting: Prompting = field(default_factory=Prompting)
+
+
+class OraclePrompter:
+    """An Attender whose grounding is the simulator's.
+
+    `alike` are the scene's objects of the target's category. Every visible object of the category
+    is a candidate, as if detected; the vote is held and kept, and then overruled. A view in which
+    the prompted object is invisible passes unmodified.
+    """
+
+    def __init__(self, attender: Attender, oracle: Oracle, alike: frozenset[str]) -> None:
+        self.attender = attender
+        self.oracle = oracle
+        self.alike = alike
+        every_step = oracle.reveal == "track"
+        self.needs_truth: Literal["never", "start", "always"] = "always" if every_step else "start"
+
+    @property
+    def highlights(self) -> bool:
+        return self.attender.prompting.highlight
+
+    @property
+    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
+        return self.attender.references
+
+    def prompted_object(self, row: EpisodeRow) -> str:
+        """The object that is prompted. Raises: BadStudy when the episode places no look-alike."""
+        if self.oracle.of == "target":
+            return row.target
+        for place in row.placements[1:]:
+            if place.model != row.goal and place.model in self.alike:
+                return place.model
+        raise BadStudy(
+            f"OraclePrompter: {row.key} places no look-alike of {row.target!r}; leave wrong-mask "
+            "out."
+        )
+
+    def start(
+        self, observation: Observation, context: PromptContext
+    ) -> tuple[AttendState, Attended]:
+        """Ground by ground truth (t = 0).
+
+        Raises: BadInstruction, unless the instruction has one target.
+        """
+        truth = _truth(context)
+        text = context.instruction
+        parsed, wanted = self.attender.understand(text)
+        if len(wanted) != 1:
+            raise BadInstruction(
+                f"OraclePrompter.start: {len(wanted)} targets in {text!r}, but the truth is about "
+                "one; name one."
+            )
+        phrase = parsed.targets[0].category
+        prompted = self.prompted_object(truth.row)
+        candidates: dict[str, tuple[Candidates, ...]] = {}
+        groundings: dict[str, tuple[Grounding, ...]] = {}
+        for camera, rgb in observation.images.items():
+            visible = self._visible(truth.masks[camera])
+            masks = list(visible.values())
+            found = self._describe(rgb, phrase, masks)
+            elected = self.attender.ground(camera, wanted[0], found)
+            choice = list(visible).index(prompted) if prompted in visible else None
+            candidates[camera] = (found,)
+            groundings[camera] = (overrule(elected, choice),)
+        state, attended = self.attender.begin(
+            parsed, observation.images, candidates, groundings, chosen_by="the simulator"
+        )
+        reveal = self.oracle.reveal
+        warning = f"the simulator's {reveal} of {prompted} is read: a bound, not a result"
+        events = (Event(0, "WARN", warning), *attended.events)
+        return state, replace(attended, events=events)
+
+    def steps(
+        self,
+        states: Sequence[AttendState],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[AttendState, Attended]]:
+        if self.needs_truth == "start":
+            views = [observation.images for observation in observations]
+            return self.attender.steps(states, views)
+        results = []
+        for state, observation, context in zip(states, observations, contexts, strict=True):
+            truth = _truth(context)
+            prompted = self.prompted_object(truth.row)
+            tracks = {}
+            for camera in observation.images:
+                mask = truth.masks[camera].get(prompted)
+                if mask is not None:
+                    mask = spoil(mask, self.oracle.area, self.oracle.shift)
+                tracks[camera] = (_track(mask),)
+            results.append(self.attender.follow(state, observation.images, tracks, state.trackers))
+        return results
+
+    def _visible(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
+        """The visible objects of the category, by name."""
+        visible = {}
+        for name, mask in masks.items():
+            if name in self.alike and mask.any():
+                visible[name] = mask
+        return visible
+
+    def _describe(self, rgb: Rgb, phrase: str, masks: Sequence[Mask]) -> Candidates:
+        """The candidates of one view: true boxes, and true masks.
+
+        The masks are the segmenter's where only the boxes are revealed.
+        """
+        xyxy = np.array([mask_box(mask) for mask in masks], np.float32).reshape(-1, 4)
+        scores = np.ones(len(xyxy), np.float32)
+        boxes = Boxes(xyxy, scores, phrase)
+        if self.oracle.reveal == "box":
+            drawn = self.attender.stack.segmenter(rgb, boxes)
+        else:
+            spoiled = [spoil(mask, self.oracle.area, self.oracle.shift) for mask in masks]
+            drawn = np.array(spoiled, bool).reshape(-1, *rgb.shape[:2])
+        embeddings = self.attender.stack.encoder([crop(rgb, box) for box in xyxy])
+        ids = tuple(range(len(xyxy)))
+        return Candidates(boxes=boxes, embeddings=embeddings, masks=drawn, ids=ids)
+
+
+def spoil(mask: Mask, area: float, shift: float) -> Mask:
+    """The mask, of `area` times its pixels, and moved right by `shift` times its width."""
+    box = mask_box(mask)
+    if box is None or (area == 1.0 and shift == 0.0):
+        return mask
+    scale = area**0.5
+    middle = (box[:2] + box[2:] - 1) / 2
+    moved = middle + np.array([shift * (box[2] - box[0]), 0])
+    warp = np.array(
+        [[scale, 0, moved[0] - scale * middle[0]], [0, scale, moved[1] - scale * middle[1]]]
+    )
+    h, w = mask.shape
+    spoiled = cv2.warpAffine(mask.astype(np.uint8), warp, (w, h), flags=cv2.INTER_NEAREST)
+    return spoiled > 0
+
+
+def _truth(context: PromptContext) -> SceneTruth:
+    assert context.truth is not None, "a prompter that needs truth is given it"
+    return context.truth
+
+
+def _track(mask: Mask | None) -> Track:
+    if mask is None or not mask.any():
+        return Track(None, 0.0)
+    return Track(mask, 1.0)
+
+
+EARLY = 0.1
+"""The share of an episode's step limit after which an early switch happens."""
+SWITCHED = "the tint is switched to "
+"""Begins the event of a switch; the name of the object follows."""
+
+
+@dataclass(frozen=True)
+class Switch:
+    """When the tint is switched: early, or once the target has moved, and so was grasped."""
+
+    when: Literal["early", "moved"]
+
+
+@value
+class SwitchState:
+    """One episode: the state of its prompting, and whether the tint was switched."""
+
+    attend: AttendState
+    switched: bool
+
+
+class SwitchPrompter:
+    """Two oracles that know the mask at every step: of the target, then of the look-alike."""
+
+    needs_truth: Literal["never", "start", "always"] = "always"
+
+    def __init__(self, attender: Attender, switch: Switch, alike: frozenset[str]) -> None:
+        self.switch = switch
+        self.before = OraclePrompter(attender, Oracle("track"), alike)
+        self.after = OraclePrompter(attender, Oracle("track", of="look-alike"), alike)
+
+    @property
+    def highlights(self) -> bool:
+        return self.before.highlights
+
+    @property
+    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
+        return self.before.references
+
+    def start(
+        self, observation: Observation, context: PromptContext
+    ) -> tuple[SwitchState, Attended]:
+        """Prompt the target. Raises: BadStudy when the episode places no look-alike of it."""
+        assert context.truth is not None, "a prompter that needs truth is given it"
+        self.after.prompted_object(context.truth.row)
+        state, attended = self.before.start(observation, context)
+        return SwitchState(state, switched=False), attended
+
+    def steps(
+        self,
+        states: Sequence[SwitchState],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[SwitchState, Attended]]:
+        results = []
+        for state, observation, context in zip(states, observations, contexts, strict=True):
+            assert context.truth is not None, "a prompter that needs truth is given it"
+            switched = state.switched or self._is_time(context.truth)
+            oracle = self.after if switched else self.before
+            ((attend, attended),) = oracle.steps([state.attend], [observation], [context])
+            if switched and not state.switched:
+                name = self.after.prompted_object(context.truth.row)
+                event = Event(context.truth.step, "WARN", f"{SWITCHED}{name}")
+                attended = replace(attended, events=(event, *attended.events))
+            results.append((SwitchState(attend, switched), attended))
+        return results
+
+    def _is_time(self, truth: SceneTruth) -> bool:
+        if self.switch.when == "early":
+            return truth.step >= EARLY * truth.row.max_steps
+        return truth.row.target in truth.moved

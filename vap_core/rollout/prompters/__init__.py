@@ -1,1 +1,0 @@
-"""What stands between the cameras and the policy under one method."""
