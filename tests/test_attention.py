@@ -17,10 +17,10 @@ from tests import tiny_lerobot as tiny
 from tests.command import vap
 from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
-from vap_core.analysis.attention import layer_effects
 from vap_core.base.errors import BadPolicy, UnknownName
 from vap_core.policies.lerobot import hooks, toy_pi0
 from vap_core.policies.lerobot.adapter import LeRobot, load_policy
+from vap_core.policies.lerobot.attribution import layer_effects
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
 from vap_core.policies.protocol import (
     ACTION,

@@ -12,7 +12,6 @@ import pytest
 from tests.command import refused, vap
 from tests.drawn import SUCCESS, columns, entities, frame, opening, rerun
 from tests.test_why import tabs
-from vap_core.analysis.attention import examples, pictures
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import DATA, SHIPPED
 from vap_core.policies.mini_pi0 import learned_token
@@ -23,6 +22,7 @@ from vap_core.recording.entities.pictures import attention_overlay
 from vap_core.recording.read import read_pictures
 from vap_core.recording.show import attended
 from vap_core.simulation import suites
+from vap_core.study import attention
 
 RUN = DATA / "results" / "mini_pi0.parquet"
 """simpler-bridge's first policy, whose token is kept."""
@@ -206,9 +206,9 @@ def test_only_the_policy_of_the_run_is_run_again(
     """Weights that were trained since would be recorded under the run's name."""
     run = DATA / "results" / "mini_pi0.parquet"
     changed = pd.read_parquet(run).assign(policy="mini_pi0:0000000000")
-    published = examples.read_runs(run)
-    monkeypatch.setattr(examples, "read_runs", lambda _: [(published[0][0], changed)])
-    monkeypatch.setattr(pictures, "register_personal", lambda *_: None)
+    published = attention.read_runs(run)
+    monkeypatch.setattr(attention, "read_runs", lambda _: [(published[0][0], changed)])
+    monkeypatch.setattr(attention, "register_personal", lambda *_: None)
     with pytest.raises(BadStudy, match="was run with mini_pi0:0000000000"):
-        examples.record(run, "simpler-fractal/pick-pen-holder/generic/0", tmp_path, tmp_path)
+        attention.record(run, "simpler-fractal/pick-pen-holder/generic/0", tmp_path, tmp_path)
     assert not list(tmp_path.rglob("*.rrd"))

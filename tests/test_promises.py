@@ -103,18 +103,17 @@ def damaged(path: Path) -> Path:
 
 def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
     from vap_core.analysis import inspection
-    from vap_core.analysis.attention import tables
-    from vap_core.study import logs, tokens
+    from vap_core.study import attention, logs, tokens
 
-    for name in tables.TABLES:
-        damaged(tmp_path / f"{tables.PREFIX}{name}.parquet")
+    for name in attention.TABLES:
+        damaged(tmp_path / f"{attention.PREFIX}{name}.parquet")
     for name in inspection.TABLES:
         damaged(tmp_path / f"perception_{name}.parquet")
     damaged(tmp_path / "traces" / "a.parquet")
     damaged(tmp_path / "audit" / "a.parquet")
     damaged(tmp_path / tokens.TABLES[0] / "a.parquet")
     for read in (
-        tables.read, inspection.published, logs.read_audit, logs.read_states, tokens.read,
+        attention.read, inspection.published, logs.read_audit, logs.read_states, tokens.read,
     ):  # fmt: skip
         with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
             list(read(tmp_path))

@@ -415,8 +415,8 @@ def policy(folder: Path, quick: bool) -> list[Arm]:
     """A call of every shipped policy, for one episode and for many at once."""
     import numpy as np
 
-    from vap_core.analysis.attention.effects import noise_input
     from vap_core.policies.lerobot.adapter import load_policy
+    from vap_core.policies.lerobot.attribution import noise_input
     from vap_core.simulation.suites import BENCHMARKS
     from vap_core.study.trials import shipped
 

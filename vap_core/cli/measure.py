@@ -479,29 +479,29 @@ def attention(
 
     Example: python -m vap_core measure attention data/results/mini_pi0.parquet --method soft,vap
         --suite vlabench
-    Example: python -m vap_core measure attention data/results/first_policy.parquet
-        --record simpler-bridge/put-camera/soft/22
+    Example: python -m vap_core measure attention data/results/mini_pi0.parquet
+        --record simpler-bridge/pick-shaver/soft/12
     """
-    from vap_core.analysis.attention import examples, replay, report
-    from vap_core.analysis.attention.tables import publish as publish_tables
     from vap_core.base.errors import command
+    from vap_core.study import attention as study
+    from vap_core.study.attention_figures import text
 
     if out is None:
         table = run.suffix == ".parquet"
         out = Path("data/runs") / f"attention-{run.stem}" if table else run / "attention"
     if record:
-        path, step = examples.record(run, record, out / "recordings", out / "memory", policy)
+        path, step = study.record(run, record, out / "recordings", out / "memory", policy)
         words = ("view", path, "--png", f"{path.stem}.png", "--attention", "--frame", str(step))
         print(f"wrote {path}\nnext: {command(*words)}")
         return
-    wanted = replay.Wanted(
+    wanted = study.Wanted(
         suites=tuple(names(suite)),
         methods=tuple(names(method)),
         policy=policy,
         episodes=episodes,
         explain=explain,
     )
-    found = replay.run_replay(run, out, wanted, workers=workers)
+    found = study.run_replay(run, out, wanted, workers=workers)
     if publish is not None:
-        publish_tables(out, publish)
-    print(report.text(found))
+        study.publish(out, publish)
+    print(text(found))
