@@ -1,4 +1,4 @@
-"""Nothing that the package starts sends anything out: Rerun, Ray, JupyterLab."""
+"""Nothing that is started sends anything out: our commands, lerobot's, Rerun, Ray, JupyterLab."""
 
 import os
 import re
@@ -13,12 +13,66 @@ from pathlib import Path
 import pytest
 
 from tests.drawn import SUCCESS, frame, opening
+from vap_core import get_object, reference_views
 from vap_core.base.errors import MissingGL
 from vap_core.recording import Recorder, show, stream
 from vap_core.recording.stream import rerun_command, rerun_environment
 from vap_core.study.cluster import ray_executor
+from vap_core.study.trials import shipped
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+NETWORK = ("-e", "trace=connect,sendto,sendmsg,sendmmsg")
+SOCKET = re.compile(r"sa_family=AF_INET6?, .*?(?:inet_addr\(|inet_pton\(AF_INET6, )\"([^\"]*)\"")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
+def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
+    tmp_path: Path,
+) -> None:
+    """With an empty home, and no variable of ours or of a CI in the environment."""
+    from PIL import Image
+
+    home, bank = tmp_path / "home", tmp_path / "memory"
+    home.mkdir()
+    photo = tmp_path / "camera.png"
+    Image.fromarray(reference_views(get_object("camera-personal"), 1)[0]).save(photo)
+    row = ("--suite", "simpler-bridge", "--task", "put-camera")
+    ours = (sys.executable, "-m", "vap_core")
+    bridge = shipped("simpler-bridge")
+    lerobot = Path(sys.executable).with_name("lerobot-eval")
+    commands = (
+        (*ours, "register", "camera-personal", "--category", "camera", photo, "--whole", "--memory", bank),
+        (*ours, "ground", photo, "bring my camera", "--memory", bank, "--out", tmp_path / "ground"),
+        (*ours, "rollout", *row, "--policy", "mini-pi0", "--out", tmp_path / "rollout"),
+        (*ours, "eval", *row, "--episodes", "1", "--methods", "vap", "--out", tmp_path / "eval"),
+        (*ours, "attach", bridge, tmp_path / "with-vap", "--memory", bank),
+        (sys.executable, lerobot, f"--policy.path={tmp_path / 'with-vap'}", "--env.type=vap",
+         "--env.task=simpler-bridge/put-camera", "--env.max_steps=3", "--eval.n_episodes=1",
+         "--eval.batch_size=1", f"--output_dir={tmp_path / 'lerobot'}"),
+    )  # fmt: skip
+    kept = {k: v for k, v in os.environ.items() if k in ("PATH", "LD_LIBRARY_PATH", "TMPDIR")}
+    environment = {**kept, "HOME": str(home), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    for number, command in enumerate(commands):
+        log = tmp_path / f"calls-{number}"
+        done = subprocess.run(
+            ["strace", "-f", "--seccomp-bpf", *NETWORK, "-o", log, *map(str, command)],
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if not log.exists() or "exited with" not in log.read_text():
+            pytest.skip("strace may not trace here")
+        assert done.returncode == 0, (command, done.stderr[-2000:])
+        reached = set(SOCKET.findall(log.read_text())) - {"127.0.0.1", "::1"}
+        assert not reached, (command, reached)
+    # Matplotlib keeps its list of this machine's fonts there.
+    written = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
+    assert written <= {(".cache", "matplotlib")}
 
 
 @pytest.fixture

@@ -5,9 +5,14 @@ The public names below load when they are first used: importing this package loa
 or rerun. Start reading at attend.py.
 """
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import lazy_loader
+
+# Before any of them is imported, in this process and in those that it starts: nothing is sent out.
+for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):
+    os.environ.setdefault(_switch, "1")
 
 if TYPE_CHECKING:
     from vap_core.attend import Attender as Attender
