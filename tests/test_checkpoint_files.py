@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,13 +12,18 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests import tiny_lerobot as tiny
+from tests.toys import personal
 from vap_core.base.errors import BadPolicy
+from vap_core.memory import save
+from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot.adapter import load_for_suite, load_policy
-from vap_core.policies.lerobot.checkpoints import RUN, fingerprint
+from vap_core.policies.lerobot.checkpoints import PIPELINES, RUN, fingerprint
+from vap_core.policies.lerobot.step import attach
 from vap_core.policies.protocol import label_of
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 from vap_core.study.store import open_run
+from vap_make.policy.start import read_start
 
 BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"
 AFTER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
@@ -154,3 +160,42 @@ def test_a_checkpoint_that_was_trained_on_is_loaded_again(copy: Path) -> None:
         second = load_for_suite(str(copy), scene, known)
     assert second.label == label_of(copy) != first.label
     assert second.sha256() != first.sha256()
+
+
+CODE = (
+    {"class": "subprocess.Popen", "config": {"args": "id"}},
+    {"class": "lerobot.processor.pipeline.import_module", "config": {}},
+    {"class": "builtins.exec"},
+    {"registry_name": None, "class": "os.system"},
+)
+DOORS = {
+    "load": lambda folder, out: load_policy(folder),
+    "attach": lambda folder, out: attach(folder, out / "attached", out / "memory"),
+    "train --start": lambda folder, out: read_start(folder, None, 0),
+}
+
+
+@pytest.mark.parametrize("pipeline", PIPELINES)
+@pytest.mark.parametrize("door", DOORS)
+def test_no_door_lets_a_checkpoint_name_code(
+    copy: Path, tmp_path: Path, door: str, pipeline: str
+) -> None:
+    mug = personal("mug", "cup", (40, 120, 110))
+    save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
+    whole = json.loads((copy / pipeline).read_text())
+    for step in CODE:
+        steps = [*whole["steps"], step]
+        (copy / pipeline).write_text(json.dumps({**whole, "steps": steps}))
+        with pytest.raises(BadPolicy, match=f"asks to run '{step['class']}', which is no step"):
+            DOORS[door](copy, tmp_path)
+    assert not (tmp_path / "attached").exists()
+
+
+def test_what_is_no_file_of_a_checkpoint_is_not_attached(copy: Path, tmp_path: Path) -> None:
+    mug = personal("mug", "cup", (40, 120, 110))
+    save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
+    for name in ("modeling.py", "state.pkl", "weights.bin"):
+        (copy / name).write_bytes(b"x")
+    attach(copy, tmp_path / "attached", tmp_path / "memory")
+    kept = {path.name for path in copy.iterdir()} - {"modeling.py", "state.pkl", "weights.bin"}
+    assert {path.name for path in (tmp_path / "attached").iterdir()} == kept

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vap_core.base.errors import BadPolicy, first_line
+from vap_core.policies.lerobot.checkpoints import refuse_code
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.policies.protocol import SHIPPED
@@ -54,6 +55,7 @@ def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
 
     torch.manual_seed(seed)
     try:
+        refuse_code(folder)
         config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
         learner = Learner(config)
         learner.policy.load_state_dict(load_file(folder / "model.safetensors"))
@@ -61,6 +63,8 @@ def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
         stats: dict[str, dict[str, Tensor]] = {}
         for name in ("observation.state", "action"):
             stats[name] = {part: kept[f"{name}.{part}"] for part in ("mean", "std")}
+    except BadPolicy:
+        raise
     except Exception as error:
         raise BadPolicy(
             f"train policy: {folder} is no mini-pi0 to go on from ({type(error).__name__}: "

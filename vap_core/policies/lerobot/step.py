@@ -41,8 +41,10 @@ from vap_core.policies.lerobot.checkpoints import (
     PIPELINES,
     STEP_CLASS,
     STEP_NAME,
+    WANTED_FILES,
     is_vap_step,
     locate,
+    refuse_code,
 )
 from vap_core.prompt import Tint
 from vap_core.simulation import suites
@@ -265,9 +267,9 @@ class VapPrompt(ProcessorStep):
 def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> Path:
     """Write a checkpoint with VAP beside the frozen one; returns its folder.
 
-    Every file is linked, and one step is added to the preprocessor, right after the renaming of
-    observations. `options` are VapPrompt's other fields. The stack is loaded once, to see that it
-    can be, and that its encoder made the memory.
+    Its files are linked, but for those of other kinds than a checkpoint's. One step is added to the
+    preprocessor, right after the renaming of observations. `options` are VapPrompt's other fields.
+    The stack is loaded once, to see that it can be, and that its encoder made the memory.
 
     Raises: BadOutput when `out` exists; BadPolicy, BadMemory, UnknownName when the parts do not
         fit; BadMemory also where `memory` holds no object, or a damaged one; as `load_stack`.
@@ -298,6 +300,7 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         ) from error
     if attached:
         raise BadPolicy(f"attach: {source} has VAP attached; give the checkpoint without it.")
+    refuse_code(source)
     step._load()  # what would fail at the first picture fails here
     entry = {"class": STEP_CLASS, "config": step.get_config()}
     pipeline["steps"].insert(place, entry)
@@ -306,7 +309,8 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         out.mkdir(parents=True)
         made = True
         for file in source.iterdir():
-            if file.name != PIPELINES[0]:
+            wanted = file.is_dir() or any(file.match(pattern) for pattern in WANTED_FILES)
+            if wanted and file.name != PIPELINES[0]:
                 os.symlink(file, out / file.name)
         (out / PIPELINES[0]).write_text(json.dumps(pipeline, indent=2))
     except OSError as error:
