@@ -11,6 +11,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 SHIPPED = (
+    "catalogue",
     "paper_tables.csv",
     "paraphrases",
     "photo-set",

@@ -21,6 +21,7 @@ from vap_core.base.pictures import empty_figure
 from vap_core.simulation.assets.objects import TIERS, lookalikes, personal_instance
 from vap_core.simulation.studio import PORTRAIT, Shot, Stage, photograph
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists
+from vap_make.objects import generic_instance
 
 CUP, PLANT = personal_instance("cup"), personal_instance("plant")
 ASIDE = Shot(1.1, 0.7, 0.6, -0.9, 0.55, (0.5, 0.6, 0.7))
@@ -73,7 +74,8 @@ def test_every_personal_object_has_a_row_from_hard_to_easy():
 
 
 def test_generics_are_in_rows():
-    rows = gallery.generic_sheet(["cup", "toy bus"], n=2, size=48)
+    kinds = {kind: [generic_instance(kind, i) for i in range(2)] for kind in ("cup", "toy bus")}
+    rows = gallery.object_sheet(kinds, size=48)
     assert list(rows) == ["cup", "toy\nbus"]
     assert [tile.picture.shape for tile in rows["cup"]] == [(48, 48, 3)] * 2
     assert not np.array_equal(rows["cup"][0].picture, rows["cup"][1].picture)

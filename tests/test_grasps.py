@@ -6,11 +6,10 @@ from itertools import count
 import numpy as np
 import pytest
 
-from vap_core.base.types import value
+from vap_core.base.types import Rgb, value
 from vap_core.simulation import grasps, robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.assets.shapes import Hull, Mesh, Solid
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.shapes import Hull, Mesh, Solid, Texture
 from vap_core.simulation.grasps import FINGER_M, HALF_PAD_M, PAD_M, TIGHT_M, TIP_M, YAWS
 
 PANDA = robots.get("panda")
@@ -32,8 +31,8 @@ class Body:
     def solids(self) -> tuple[Solid, ...] | tuple[Hull, ...]:
         return self.parts
 
-    def aspect(self) -> float:
-        return 1.0
+    def picture(self) -> Rgb:
+        raise NotImplementedError
 
 
 @pytest.fixture
@@ -43,9 +42,9 @@ def make(monkeypatch):
     def enter(*parts: Solid | Hull) -> str:
         name = f"brick-{next(NUMBER)}"
         monkeypatch.setitem(
-            objects.OBJECTS,
+            objects.BAKED,
             name,
-            objects.ObjectModel(name, "brick", "prop", Body(parts), PAINT, 0.1),
+            objects.ObjectModel(name, "brick", "prop", {}, PAINT, 0.1, Body(parts)),
         )
         return name
 

@@ -55,7 +55,7 @@ def test_an_imported_mug_is_an_object_like_any_other(shelf):
     assert (model.category, model.split) == ("cup", "personal")
     assert objects.extent_m(model) == pytest.approx((0.07, 0.07, 0.09), abs=1e-6)
     assert objects.mesh_of(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
-    solids = model.shape.solids()
+    solids = model.form.solids()
     assert 4 <= len(solids) <= convex_parts.HULLS
     assert model.mass_kg == pytest.approx(
         np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4

@@ -13,9 +13,6 @@ from tqdm import tqdm
 from tests.command import refused, vap
 from tests.scanned import box, put
 from vap_core.base.errors import BadObject, BadOutput, BadStudy
-from vap_core.simulation.assets.scans.closed_parts import blob, hollow, lathe, ring, tube
-from vap_core.simulation.assets.scans.design_paint import LOUD, QUIET, SIDE, draw_colours
-from vap_core.simulation.assets.scans.designs import FORMS, HANDLED, draw_design, write_designs
 from vap_core.simulation.assets.scans.mesh_file import _weld
 from vap_core.simulation.assets.scans.mesh_repair import count_edge_flaws
 from vap_core.simulation.assets.scans.storage import VARIABLE
@@ -31,6 +28,9 @@ from vap_core.study.objects import (
     read_source,
     text_report,
 )
+from vap_make.objects.closed_parts import blob, hollow, lathe, ring, tube
+from vap_make.objects.design_paint import LOUD, QUIET, SIDE, draw_colours
+from vap_make.objects.designs import FORMS, HANDLED, draw_design, write_designs
 
 
 def volume(corner: np.ndarray) -> float:

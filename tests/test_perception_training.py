@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.simulation.assets import crafts, fabrics, objects, phrases, textures
+from vap_core.simulation.assets import objects, phrases
 from vap_make.films import scenes
+from vap_make.objects import crafts, draw, fabrics, generic_instance, textures
 from vap_make.perception import detector, evaluation, instance_head, segmenter
 from vap_make.perception import train as perception
 
@@ -28,11 +29,11 @@ def test_no_evaluation_object_is_ever_cast(seed: int, held_out: bool) -> None:
 @given(st.sampled_from(objects.CATEGORIES), st.integers(0, 10**6), st.integers(1, 6))
 def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: int) -> None:
     first, twin = (
-        objects.generic_instance(kind, index),
-        objects.generic_instance(kind, index, number),
+        generic_instance(kind, index),
+        generic_instance(kind, index, number),
     )
     assert twin.name == f"{first.name}-{number}"
-    assert repr(objects.get_object(twin.name)) == repr(twin)
+    assert repr(draw(twin.name)) == repr(twin)
     assert (twin.category, twin.split) == (first.category, "generic")
     assert repr(twin.texture) != repr(first.texture)
     assert {twin.texture.motif, first.texture.motif} <= {
@@ -45,7 +46,7 @@ def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: 
 
 def test_evaluation_objects_are_refused() -> None:
     with pytest.raises(ValueError, match="cup-personal belong to evaluation"):
-        scenes.only_generic([objects.generic_instance("cup", 0), objects.personal_instance("cup")])
+        scenes.only_generic([generic_instance("cup", 0), objects.personal_instance("cup")])
 
 
 def test_the_same_stage_has_the_same_pixels() -> None:

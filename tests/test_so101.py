@@ -13,6 +13,7 @@ import pytest
 from jaxtyping import Float64
 
 from vap_core.base.errors import OutOfReach
+from vap_core.base.types import Rgb
 from vap_core.simulation import scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.shapes import Mesh, Solid
@@ -157,14 +158,14 @@ class Block:
             ),
         )
 
-    def aspect(self) -> float:
-        return 1.0
+    def picture(self) -> Rgb:
+        return np.zeros((8, 8, 3), np.uint8)
 
 
 BLOCK = replace(
     objects.personal_instance("pen holder"),
     name="block",
-    shape=Block(0.05, 0.07, 0.07),
+    form=Block(0.05, 0.07, 0.07),
     mass_kg=0.1,
 )
 THINGS = {

@@ -19,6 +19,7 @@ from vap_core.simulation.studio import reference_views
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = (
+    "catalogue",
     "paper_tables.csv",
     "paraphrases",
     "photo-set",

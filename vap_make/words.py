@@ -9,7 +9,7 @@ from vap_core.perception import describe
 from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import CATEGORIES, CLUTTER
-from vap_core.simulation.assets.textures import Texture
+from vap_core.simulation.assets.shapes import Texture
 from vap_core.simulation.suites import BENCHMARKS
 
 DETERMINERS = ("my", "the", "a")

@@ -23,10 +23,10 @@ from .gallery import bounds_table as bounds_table
 from .gallery import camera_images as camera_images
 from .gallery import census as census
 from .gallery import frame_sheet as frame_sheet
-from .gallery import generic_sheet as generic_sheet
 from .gallery import hardness as hardness
 from .gallery import lookalike_sheet as lookalike_sheet
 from .gallery import lookalikes_by_tier as lookalikes_by_tier
+from .gallery import object_sheet as object_sheet
 from .gallery import out_of_order as out_of_order
 from .gallery import reference_sheet as reference_sheet
 from .gallery import same_layout as same_layout

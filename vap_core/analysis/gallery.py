@@ -22,7 +22,6 @@ from vap_core.simulation.assets.objects import (
     OBJECTS,
     TIERS,
     ObjectModel,
-    generic_instance,
     lookalikes,
     personal_instance,
     tier,
@@ -90,14 +89,10 @@ def lookalike_sheet(stage: Stage, goals: Sequence[ObjectModel] = ()) -> dict[str
     return sheet
 
 
-def generic_sheet(kinds: Sequence[str], n: int = 6, size: int = 160) -> dict[str, list[Tile]]:
-    """One row per kind: its first `n` generic instances, which training draws from.
-
-    A kind is a category, or the stem of a family.
-    """
-    models: dict[str, list[ObjectModel]] = {}
-    for kind in kinds:
-        models[kind] = [generic_instance(kind, i) for i in range(n)]
+def object_sheet(
+    models: Mapping[str, Sequence[ObjectModel]], size: int = 160
+) -> dict[str, list[Tile]]:
+    """One row per kind, with its objects."""
     sheet = {}
     with Stage(list(chain.from_iterable(models.values())), size) as stage:
         for kind, row in models.items():

@@ -27,12 +27,15 @@ SOURCES = ("simulation/assets", "simulation/studio.py", "perception/embedded", "
 
 @cache
 def source_digest() -> str:
-    """A digest of `SOURCES` and of the shipped weights."""
+    """A digest of `SOURCES`, of the shipped objects and of the shipped weights."""
     import vap_core
     from vap_core.perception.embedded.networks import FOLDER
+    from vap_core.simulation.assets.objects import FORMS, ROWS
 
     package = Path(vap_core.__file__).parent
     found = hashlib.sha256((FOLDER / "manifest.json").read_bytes())
+    for file in (ROWS, FORMS):
+        found.update(file.read_bytes())
     for part in SOURCES:
         found.update(code_digest(package / part).encode())
     return found.hexdigest()[:16]

@@ -402,7 +402,7 @@ def designs(
     Example: python -m vap_core objects designs data/designs --seed 1
     """
     from vap_core.base.errors import command
-    from vap_core.simulation.assets.scans.designs import TABLE, write_designs
+    from vap_make.objects.designs import TABLE, write_designs
 
     paths = write_designs(out, count, seed)
     print(f"wrote {len(paths)} designs to {out}, and their kinds to {out / TABLE}")
@@ -415,7 +415,7 @@ def list_objects() -> None:
 
     Example: python -m vap_core objects list
     """
-    from vap_core.simulation.assets.listing import object_table
+    from vap_core.simulation.assets.objects import object_table
 
     print(object_table())
 

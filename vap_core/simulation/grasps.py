@@ -106,7 +106,7 @@ def _hull_edges(
     from trimesh import convex, creation
 
     parts = []
-    for solid in objects.get_object(name).shape.solids():
+    for solid in objects.get_object(name).form.solids():
         if isinstance(solid, Hull):
             hull = convex.convex_hull(solid.vertex)
             parts.append((np.asarray(hull.vertices), np.asarray(hull.edges_unique, np.float64)))

@@ -19,6 +19,7 @@ from vap_core.simulation.types import EpisodeRow
 from vap_core.study.perception import View, object_under_box, opening_views, registered_object
 from vap_core.vote import compare, nominate, vote
 from vap_make.films.demonstrations import draw_objects, row
+from vap_make.objects import generic_instance
 from vap_make.recipe import filmed_tasks
 
 Case = Literal["present", "look-alikes", "absent"]
@@ -54,7 +55,7 @@ def absent_lookalike(start: EpisodeRow) -> str:
     index = int(numbers.partition("-")[0])
     placed = {place.model for place in start.placements}
     for twin in range(TWINS):
-        name = objects.generic_instance(stem, index, twin).name
+        name = generic_instance(stem, index, twin).name
         if name not in placed:
             return name
     raise RuntimeError(f"every twin of {start.target} is in the scene")

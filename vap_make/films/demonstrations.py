@@ -34,6 +34,7 @@ from vap_make.films import pairs
 from vap_make.films.looks import draw_look
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_make.folder import kept_arrays
+from vap_make.objects import generic_instance
 from vap_make.recipe import FILMED, RECIPES, every, filmed_tasks
 
 SIDE = 112
@@ -116,18 +117,18 @@ def draw_objects(
     models = []
     if rng.random() < 0.5:
         for twin in rng.permutation(6)[: rivals + 1]:
-            models.append(objects.generic_instance(task.stem, first, int(twin)))
+            models.append(generic_instance(task.stem, first, int(twin)))
     else:
         others = [i for i in pool if i != first]
         for i in (first, *rng.choice(others, rivals, replace=False)):
-            models.append(objects.generic_instance(task.stem, int(i)))
+            models.append(generic_instance(task.stem, int(i)))
     kinds = [kind for kind in DISTRACTORS if kind != task.category]
     # Left out after the draw, which every later one hangs on.
     unseen = RECIPES[known.name].held_out_category
     seen = [kind for kind in rng.permutation(kinds) if kind != unseen]
     for kind in seen[:distractors]:
         index = pool[int(rng.integers(len(pool)))]
-        models.append(objects.generic_instance(str(kind), index))
+        models.append(generic_instance(str(kind), index))
     only_generic(models)
     names = [model.name for model in models]
     if task.goal:

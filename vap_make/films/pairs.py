@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import Suite, Task, shared
 from vap_core.simulation.suites.layout import place_at_random_yaws
 from vap_core.simulation.types import EpisodeRow
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
+from vap_make.objects import generic_instance
 
 EACH = 2
 """Objects of either category."""
@@ -31,10 +31,10 @@ def draw_objects(task: Task, rng: np.random.Generator, held_out: bool = False) -
         instances = first + rng.choice(TRAIN_INSTANCES, EACH, replace=False)
         if rng.random() < 0.5:
             for twin in rng.permutation(6)[:EACH]:
-                models.append(objects.generic_instance(stem, int(instances[0]), int(twin)))
+                models.append(generic_instance(stem, int(instances[0]), int(twin)))
         else:
             for i in instances:
-                models.append(objects.generic_instance(stem, int(i)))
+                models.append(generic_instance(stem, int(i)))
     only_generic(models)
     return [model.name for model in models]
 

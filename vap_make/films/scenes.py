@@ -23,6 +23,7 @@ from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.simulation.scene_style import DEFAULT_STYLE, Colour3, SceneStyle
 from vap_core.simulation.studio import Shot, Stage
 from vap_make.folder import kept_arrays
+from vap_make.objects import generic_instance
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
@@ -83,7 +84,7 @@ def only_generic(models: Sequence[ObjectModel]) -> None:
     if wrong:
         raise ValueError(
             f"training.scenes: {', '.join(wrong)} belong to evaluation and are never trained on; "
-            "use objects.generic_instance."
+            "use vap_make.objects.generic_instance."
         )
 
 
@@ -101,12 +102,12 @@ def draw_objects(rng: Generator, held_out: bool) -> tuple[list[ObjectModel], int
     stem = _draw_stem(rng, leader)
     models = []
     for twin in rng.permutation(6)[:crew]:
-        models.append(objects.generic_instance(stem, index, int(twin)))
+        models.append(generic_instance(stem, index, int(twin)))
     for kind in other_kinds[: int(rng.integers(1, 4))]:
         count = 1 + int(rng.random() < 0.3)
         for i in rng.choice(TRAIN_INSTANCES, size=count, replace=False):
             bystander = _draw_stem(rng, kind)
-            models.append(objects.generic_instance(bystander, first + int(i)))
+            models.append(generic_instance(bystander, first + int(i)))
     only_generic(models)
     return models, crew
 

@@ -25,6 +25,7 @@ from vap_core.study.processes import results_here
 from vap_make.films.demonstrations import Film
 from vap_make.films.scenes import TRAIN_INSTANCES, only_generic
 from vap_make.folder import reading_kept
+from vap_make.objects import generic_instance
 from vap_make.policy.commands import Embedding
 
 PHOTOS = 5
@@ -148,7 +149,7 @@ def _photos(name: str, crew: Sequence[str], seed: int) -> Photos:
     kinds = [kind for kind in objects.CATEGORIES if kind != category]
     others: list[Rgb] = []
     for kind in rng.choice(kinds, OTHERS, replace=False):
-        instance = objects.generic_instance(str(kind), int(rng.integers(TRAIN_INSTANCES)))
+        instance = generic_instance(str(kind), int(rng.integers(TRAIN_INSTANCES)))
         others += _photograph(instance.name, 1, seed)
     return Photos(_photograph(name, PHOTOS, seed), tuple(rivals), tuple(others))
 

@@ -76,7 +76,7 @@ def _add_visual_geom(spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: Objec
 
 def _add_collision_geoms(spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: ObjectModel) -> None:
     """One geom per solid; the object's mass is shared out by volume."""
-    solids: tuple[Solid | Hull, ...] = model.shape.solids()
+    solids: tuple[Solid | Hull, ...] = model.form.solids()
     volume = np.array([solid.volume for solid in solids])
     masses_kg = model.mass_kg * volume / volume.sum()
     for i, solid in enumerate(solids):

@@ -1,21 +1,20 @@
-"""What an object is made of: one textured triangle mesh and a handful of collision solids.
+"""What an object is made of: a textured triangle mesh, collision solids, and its decoration.
 
-Lengths are metres. Every shape stands on z = 0, centred on the z axis, with its front towards -y.
+Lengths are metres. Every object stands on z = 0, centred on the z axis, with its front towards -y.
 """
 
-from collections.abc import Sequence
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vap_core.base.types import value
+from vap_core.base.types import Rgb, value
 
 Number = float | int
 Vector = tuple[Number, Number, Number]
 """A position or three half-sizes, metres."""
-SIDES = (-1, 1)
-"""Signs of the two sides of a symmetric body: -x or -y first."""
+Srgb = tuple[int, int, int]
+"""A colour, 0..255 a channel."""
 
 
 @value
@@ -34,14 +33,9 @@ class Mesh:
         self, offset: Vector | np.ndarray = (0, 0, 0), rotation: np.ndarray | None = None
     ) -> "Mesh":
         """The mesh turned by the 3 x 3 rotation, then shifted by `offset` metres."""
-        if rotation is None:
-            rotation = np.eye(3)
-        return Mesh(
-            vertex=self.vertex @ rotation.T + np.array(offset, np.float64),
-            normal=self.normal @ rotation.T,
-            uv=self.uv,
-            face=self.face,
-        )
+        turn = np.eye(3) if rotation is None else rotation
+        vertex = self.vertex @ turn.T + np.array(offset, np.float64)
+        return Mesh(vertex, self.normal @ turn.T, self.uv, self.face)
 
 
 @value
@@ -74,14 +68,8 @@ class Solid:
 
     def rotation(self) -> np.ndarray:
         """Body from solid, 3 x 3, for a primitive that lies along its own z."""
-        match self.axis:
-            case "x":
-                lay = rotation_matrix(y=np.pi / 2)
-            case "y":
-                lay = rotation_matrix(x=-np.pi / 2)
-            case "z":
-                lay = np.eye(3)
-        return rotation_matrix(*self.euler) @ lay
+        lay = {"x": (0, np.pi / 2, 0), "y": (-np.pi / 2, 0, 0), "z": (0, 0, 0)}[self.axis]
+        return rotation_matrix(*self.euler) @ rotation_matrix(*lay)
 
 
 @value
@@ -92,20 +80,34 @@ class Hull:
     volume: float
 
 
+@value
+class Texture:
+    """A decoration: `motif` is a glyph that is repeated, or a fill, fabric or craft.
+
+    `repeats` counts motifs around the body. Motifs "word" and "digit" draw `word`. `seed` places
+    scattered glyphs and random fills.
+    """
+
+    base: Srgb
+    ink: Srgb
+    accent: Srgb
+    motif: str
+    layout: str = "full"
+    repeats: int = 4
+    word: str = ""
+    seed: int = 0
+
+
 @runtime_checkable
-class Shape(Protocol):
-    """The parameters of one body, which give its mesh and its collision solids."""
+class Form(Protocol):
+    """Where an object's mesh, collision solids and picture come from."""
 
-    def mesh(self) -> Mesh:
-        """The visual mesh, with texture coordinates into the body's texture."""
-        ...
+    def mesh(self) -> Mesh: ...
 
-    def solids(self) -> tuple[Solid, ...] | tuple[Hull, ...]:
-        """The collision solids, in the mesh's frame."""
-        ...
+    def solids(self) -> tuple[Solid, ...] | tuple[Hull, ...]: ...
 
-    def aspect(self) -> float:
-        """Circumference of the decorated wall over its height."""
+    def picture(self) -> Rgb:
+        """What the mesh's texture coordinates point into."""
         ...
 
 
@@ -118,41 +120,3 @@ def rotation_matrix(x: Number = 0, y: Number = 0, z: Number = 0) -> np.ndarray:
     about_y = np.array([[cos_y, 0, sin_y], [0, 1, 0], [-sin_y, 0, cos_y]])
     about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
     return about_z @ about_y @ about_x
-
-
-def join_meshes(parts: Sequence[Mesh]) -> Mesh:
-    """All parts as one mesh."""
-    vertices, normals, uvs, faces = [], [], [], []
-    first_vertex = 0
-    for part in parts:
-        vertices.append(part.vertex)
-        normals.append(part.normal)
-        uvs.append(part.uv)
-        faces.append(part.face + first_vertex)
-        first_vertex += len(part.vertex)
-    return Mesh(
-        vertex=np.concatenate(vertices),
-        normal=np.concatenate(normals),
-        uv=np.concatenate(uvs),
-        face=np.concatenate(faces),
-    )
-
-
-def foot_box(radius: Number) -> Solid:
-    """A square foot inside the circle: boxes rest on four contacts, cylinders on fewer."""
-    return Solid("box", (0.74 * radius, 0.74 * radius, 0.002), (0, 0, 0.002))
-
-
-def upright_cylinder(radius: float, low: float, high: float) -> Solid:
-    """A cylinder around the z axis from z = `low` to z = `high`."""
-    return Solid("cylinder", (radius, (high - low) / 2), (0, 0, (high + low) / 2))
-
-
-def stacked_cylinders(
-    radii: Float[np.ndarray, " k"], levels: Float[np.ndarray, " k_plus_1"]
-) -> tuple[Solid, ...]:
-    """Cylinders around the z axis; number i stands between `levels` i and i + 1."""
-    stack = []
-    for i, radius in enumerate(radii):
-        stack.append(upright_cylinder(float(radius), float(levels[i]), float(levels[i + 1])))
-    return tuple(stack)

@@ -11,7 +11,6 @@ from itertools import permutations, product
 
 import numpy as np
 
-from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import simpler, tabletop, vlabench
 from vap_core.simulation.suites.layout import (
     Spot,
@@ -53,7 +52,7 @@ def rows(known: Suite) -> tuple[EpisodeRow, ...]:
 
 def instance(task: Task, twin: int = 0) -> str:
     """The personal object of a task, or one of its look-alikes."""
-    return objects.generic_instance(task.stem, INSTANCE, twin).name
+    return f"{task.stem}-generic-{INSTANCE}" + (f"-{twin}" if twin else "")
 
 
 def _square(

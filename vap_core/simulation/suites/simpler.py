@@ -12,7 +12,6 @@ from itertools import permutations, product
 
 import numpy as np
 
-from vap_core.simulation.assets import objects
 from vap_core.simulation.suites.layout import (
     Area,
     draw_lookalikes,
@@ -203,7 +202,7 @@ def _add_distractors(
     names = []
     for kind in rng.permutation(kinds)[:n_distractors]:
         number = NOVEL + int(rng.integers(20))
-        names.append(objects.generic_instance(str(kind), number).name)
+        names.append(f"{str(kind).replace(' ', '-')}-generic-{number}")
     fixed = []
     for placed in placements:
         radius = 0.06 if placed.model == task.goal else radius_m(placed.model)

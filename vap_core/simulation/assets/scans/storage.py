@@ -46,8 +46,8 @@ class Scan:
     def solids(self) -> tuple[Hull, ...]:
         return self.hulls
 
-    def aspect(self) -> float:
-        return self.image.shape[1] / self.image.shape[0]
+    def picture(self) -> Rgb:
+        return self.image
 
 
 @value

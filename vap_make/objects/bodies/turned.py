@@ -1,0 +1,205 @@
+"""Surfaces turned around the z axis or swept along a path, and simple parts made of them.
+
+Lengths are metres. `swatch` is a number of `textures`, or `DECORATED` for the decoration.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from vap_core.simulation.assets.triangles import area_vectors
+from vap_make.objects.shapes import Mesh, Number, join_meshes
+from vap_make.objects.textures import DECORATED, decoration_v, swatch_uv
+
+Profile = list[tuple[Number, Number]]
+"""A run of (radius, z) points."""
+CIRCLE = (1, 1, 2)
+
+
+def lathe(
+    profile: Profile,
+    swatch: int,
+    segments: int = 24,
+    section: tuple[Number, Number, Number] = CIRCLE,
+    wraps: int = 1,
+) -> Mesh:
+    """A smooth profile turned around z.
+
+    The profile runs with the outside on its right: up the outer wall, down the inner. `section` is
+    (x, y, p): the cross-section is the superellipse |x'/x|^p + |y'/y|^p = 1 scaled by the radius.
+    The decoration goes `wraps` times around.
+    """
+    knots = np.array(profile, np.float64)
+    tangent = np.gradient(knots, axis=0)
+    angle = 2 * np.pi * np.linspace(0, 1, segments + 1) - 1.5 * np.pi
+    half_x, half_y, power = section
+    cos, sin = np.cos(angle), np.sin(angle)
+    reach = (np.abs(cos / half_x) ** power + np.abs(sin / half_y) ** power) ** (-1 / power)
+    ring = np.stack([reach * cos, reach * sin], 1)
+    outward = np.stack(
+        [
+            np.sign(cos) * np.abs(ring[:, 0] / half_x) ** (power - 1) / half_x,
+            np.sign(sin) * np.abs(ring[:, 1] / half_y) ** (power - 1) / half_y,
+        ],
+        1,
+    )
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    shape = (len(knots), segments + 1)
+    z = np.broadcast_to(knots[:, None, 1:], (*shape, 1))
+    grid = np.concatenate([knots[:, None, :1] * ring[None], z], 2)
+    scale = float(np.hypot(*ring.T).mean())
+    normal_z = np.broadcast_to(-scale * tangent[:, None, :1], (*shape, 1))
+    normal = np.concatenate([tangent[:, None, 1:] * outward[None], normal_z], 2)
+    if swatch != DECORATED:
+        return _mesh_of_grid(grid, normal, swatch_uv(swatch, shape))
+    up = _path_length(knots * (scale, 1))
+    around = _path_length(ring)
+    v = decoration_v(1 - up / up[-1])
+    return _mesh_of_grid(grid, normal, np.stack(np.meshgrid(wraps * around / around[-1], v), 2))
+
+
+def _path_length(points: np.ndarray) -> np.ndarray:
+    """Distance along the points from the first to each."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def _mesh_of_grid(grid: np.ndarray, normal: np.ndarray, uv: np.ndarray) -> Mesh:
+    """A (k, m) grid of points as triangles, without those that have collapsed."""
+    vertex = grid.reshape(-1, 3)
+    face = grid_faces(*grid.shape[:2])
+    alive = np.linalg.norm(area_vectors(vertex[face]), axis=1) > 1e-10
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return Mesh(
+        vertex=vertex,
+        normal=(normal / np.maximum(length, 1e-12)).reshape(-1, 3),
+        uv=uv.reshape(-1, 2),
+        face=face[alive],
+    )
+
+
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Two triangles for every cell of a grid of points, numbered row by row."""
+    i = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    lower = np.stack([i, i + 1, i + columns + 1], 1)
+    upper = np.stack([i, i + columns + 1, i + columns], 1)
+    return np.concatenate([lower, upper])
+
+
+def tube(
+    path: Float[np.ndarray, "k 3"],
+    radius: Number,
+    swatch: int,
+    sides: int = 6,
+    capped: bool = True,
+) -> Mesh:
+    """A round bar along a path; `capped`, its ends are closed by points.
+
+    A closed path repeats its first point as its last and needs no caps.
+    """
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    if abs(along[:, 1]).max() < 0.9:
+        reference = np.array([0.0, 1.0, 0.0])
+    else:
+        reference = np.array([1.0, 0.0, 0.0])
+    first = np.cross(along, reference)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(along, first)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
+    normal = np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
+    grid = path[:, None] + radius * normal
+    if capped:
+        ring = (1, sides + 1, 3)
+        start, end = np.broadcast_to(path[0], ring), np.broadcast_to(path[-1], ring)
+        grid = np.concatenate([start, grid, end])
+        back, ahead = np.broadcast_to(-along[0], ring), np.broadcast_to(along[-1], ring)
+        normal = np.concatenate([back, normal, ahead])
+    return _mesh_of_grid(grid, normal, swatch_uv(swatch, grid.shape[:2]))
+
+
+def arc_profile(
+    centre: tuple[Number, Number], half: tuple[Number, Number], angles: Float[np.ndarray, " k"]
+) -> Profile:
+    """Points of an ellipse in the (radius, z) plane; angle 0 points outwards, pi / 2 up."""
+    profile: Profile = []
+    for angle in angles:
+        radius = centre[0] + half[0] * float(np.cos(angle))
+        profile.append((radius, centre[1] + half[1] * float(np.sin(angle))))
+    return profile
+
+
+def smooth_profile(knots: Profile, rows: int) -> Profile:
+    """A smooth profile through the knots (radius over z), evenly apart in z."""
+    from scipy.interpolate import PchipInterpolator
+
+    radius, z = np.array(knots).T
+    levels = np.linspace(z[0], z[-1], rows)
+    radii = PchipInterpolator(z, radius)(levels)
+    return list(zip(radii.tolist(), levels.tolist(), strict=True))
+
+
+def ellipsoid(
+    half: tuple[Number, Number, Number], swatch: int, segments: int = 12, rows: int = 6
+) -> Mesh:
+    """An ellipsoid around the origin with the given half-axes."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, rows + 1)
+    profile = arc_profile((0.0, 0.0), (1.0, half[2]), angles)
+    return lathe(profile, swatch, segments, section=(half[0], half[1], 2))
+
+
+def closed_cylinder(
+    radius: Number, height: Number, swatch: int, segments: int = 20, top: int | None = None
+) -> Mesh:
+    """A cylinder that stands on z = 0; `top` is the swatch of its upper face."""
+    if top is None:
+        top = swatch
+    return join_meshes(
+        [
+            lathe([(0, 0), (radius, 0)], swatch, segments),
+            lathe([(radius, 0), (radius, height)], swatch, segments),
+            lathe([(radius, height), (0, height)], top, segments),
+        ]
+    )
+
+
+def rounded_block(
+    half: tuple[Number, Number],
+    height: Number,
+    swatch: int,
+    power: Number = 8,
+    segments: int = 16,
+) -> Mesh:
+    """A closed prism on z = 0 whose section is a rectangle with rounded corners.
+
+    A higher `power` makes the corners sharper.
+    """
+    section = (*half, power)
+    return join_meshes(
+        [
+            lathe([(0, 0), (1, 0)], swatch, segments, section),
+            lathe([(1, 0), (1, height)], swatch, segments, section),
+            lathe([(1, height), (0, height)], swatch, segments, section),
+        ]
+    )
+
+
+def handle_bar(
+    kind: str,
+    radius: Number,
+    low: Number,
+    high: Number,
+    reach: Number,
+    thickness: Number,
+    swatch: int,
+) -> Mesh:
+    """A bar from (radius, 0, low) out along +x by `reach` and back at `high`.
+
+    `kind` is "round", "square" or "ear" (wider above); `thickness` is the bar's radius.
+    """
+    power = {"round": 1.0, "square": 0.45, "ear": 0.8}[kind]
+    t = np.linspace(-np.pi / 2, np.pi / 2, 11)
+    bend = np.ones_like(t)
+    if kind == "ear":
+        bend = 0.84 + 0.16 * np.sin(t)
+    x = radius - 0.001 + reach * bend * np.abs(np.cos(t)) ** power
+    z = (low + high) / 2 + (high - low) / 2 * np.sign(np.sin(t)) * np.abs(np.sin(t)) ** power
+    return tube(np.stack([x, np.zeros_like(t), z], 1), thickness, swatch)
