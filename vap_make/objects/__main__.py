@@ -49,7 +49,7 @@ class Bake:
         self.pictures: dict[str, Rgb] = {}
 
     def add(self, model: ObjectModel) -> None:
-        """Equal meshes of a stem are held once; a red picture as its colours where they suffice."""
+        """Equal meshes of a stem are held once; a red picture as its change of colours."""
         form = model.form
         assert isinstance(form, Drawn)
         name, texture, wall = model.name, form.texture, 0
@@ -60,14 +60,12 @@ class Bake:
                 self.files[f"{name}.png"] = _image(draw_spots(texture, 1024, wall), "PNG")
         else:
             self.pictures[name] = picture = form.picture()
-            colours = None
             if plain != name:
-                colours = _changed_colours(self.pictures[plain], picture)
-            if colours is None:
+                colours, picture = _changed_colours(self.pictures[plain], picture)
+                self.files[f"{name}.npy"] = _array(colours)
+            if plain == name or picture.any():
                 how = {"lossless": True, "exact": True, "quality": 100, "method": 6}
                 self.files[f"{name}.webp"] = _image(picture, "WEBP", **how)
-            else:
-                self.files[f"{name}.npy"] = _array(colours)
         if plain == name:
             self._add_row(model, form, wall)
 
@@ -125,13 +123,18 @@ def _equal(one: Mesh, other: Mesh) -> bool:
     return all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
 
 
-def _changed_colours(before: Rgb, after: Rgb) -> np.ndarray | None:
-    """The colours of one picture, sorted, and what each is in the other; None if it varies."""
+def _changed_colours(before: Rgb, after: Rgb) -> tuple[np.ndarray, Rgb]:
+    """The colours of one picture, sorted, with what each is in the other, and the rest that adds.
+
+    It is modulo 256, and nothing but zeros where every colour becomes one other.
+    """
     pixels, becomes = before.reshape(-1, 3), after.reshape(-1, 3)
-    _, first, at = np.unique(pixels @ KEY, return_index=True, return_inverse=True)
-    if not np.array_equal(becomes[first[at]], becomes):
-        return None
-    return np.stack([pixels[first], becomes[first]])
+    _, first, at, n = np.unique(
+        pixels @ KEY, return_index=True, return_inverse=True, return_counts=True
+    )
+    mean = np.stack([np.bincount(at, channel) / n for channel in becomes.T], axis=1)
+    new = np.rint(mean).astype(np.uint8)
+    return np.stack([pixels[first], new]), (becomes - new[at]).reshape(before.shape)
 
 
 def _image(pixels: np.ndarray, kind: str, **how: Any) -> bytes:

@@ -67,7 +67,8 @@ class Baked:
     """The mesh, the solids and the picture of an object in `forms.zip`.
 
     `mesh_at` is the mesh's first and last vertex and face among those of its stem. Of a wall with
-    random spots the archive has the spots; `wall_px` is how high it was drawn.
+    random spots the archive has the spots; `wall_px` is how high it was drawn. Of a red picture it
+    has what every colour of the plain one becomes and, where that is not all, the rest.
     """
 
     name: str
@@ -80,9 +81,9 @@ class Baked:
     def mesh(self) -> Mesh:
         corner, face = _meshes(self.stem)
         first, last, first_face, last_face = self.mesh_at
-        vertex, normal, uv = np.split(corner[:, first:last], (3, 6))
-        columns = (np.ascontiguousarray(part.T) for part in (vertex, normal, uv))
-        return Mesh(*columns, face[first_face:last_face])
+        parts = np.split(corner[:, first:last], (3, 6))
+        vertex, normal, uv = (np.ascontiguousarray(part.T) for part in parts)
+        return Mesh(vertex, normal, uv, face[first_face:last_face])
 
     def solids(self) -> tuple[Solid, ...]:
         return self.solid
@@ -91,10 +92,12 @@ class Baked:
         plain = self.name.removesuffix(RED)
         if self.wall_px:
             return speckled(self.texture, _image(f"{plain}.png"), self.wall_px)
-        if f"{self.name}.webp" in _contents():
-            return _image(f"{self.name}.webp")
+        if plain == self.name:
+            return _image(f"{plain}.webp")
         before, after = np.load(io.BytesIO(_read(f"{self.name}.npy")))
-        return after[np.searchsorted(before @ KEY, _image(f"{plain}.webp") @ KEY)]
+        picture = after[np.searchsorted(before @ KEY, _image(f"{plain}.webp") @ KEY)]
+        rest = f"{self.name}.webp"
+        return picture + _image(rest) if rest in _contents() else picture
 
 
 def _read(name: str) -> bytes:
@@ -173,8 +176,8 @@ def _catalogue() -> dict[str, ObjectModel]:
         form = Baked(
             row["name"], texture, tuple(solids), row["stem"], mesh_at, row.get("wall_px", 0)
         )
-        about = (row[part] for part in ("name", "category", "split", "shape"))
-        models[row["name"]] = ObjectModel(*about, texture, row["mass_kg"], form)
+        about = {part: row[part] for part in ("name", "category", "split", "shape", "mass_kg")}
+        models[row["name"]] = ObjectModel(**about, texture=texture, form=form)
     return models
 
 
@@ -188,7 +191,8 @@ CATEGORIES: tuple[str, ...] = tuple(
     dict.fromkeys(model.category for model in OBJECTS.values() if model.split == "personal")
 )
 """Categories with evaluation instances."""
-MAKERS: list[Callable[[str], ObjectModel | None]] = []
+type Maker = Callable[[str], ObjectModel | None]
+MAKERS: list[Maker] = []
 """Where `get_object` looks for a name that is not baked. `vap_make.objects` adds its generator."""
 
 
@@ -212,9 +216,10 @@ def tier(lookalike: ObjectModel) -> Tier:
     hard: base and ink are both shared; medium: one of them; easy: neither.
     """
     stem, _, _ = lookalike.name.partition("-lookalike-")
-    textures = (lookalike.texture, OBJECTS[f"{stem}-personal"].texture)
-    ours, personal = ({texture.base, texture.ink} for texture in textures)
-    return ("easy", "medium", "hard")[len(ours & personal)]
+    ours, personal = lookalike.texture, OBJECTS[f"{stem}-personal"].texture
+    assert isinstance(ours, Texture)
+    assert isinstance(personal, Texture)
+    return ("easy", "medium", "hard")[len({ours.base, ours.ink} & {personal.base, personal.ink})]
 
 
 @lru_cache(maxsize=512)
@@ -223,12 +228,11 @@ def _red(name: str) -> ObjectModel | None:
     model = BAKED.get(name.removesuffix(RED))
     if model is None or not isinstance(model.form, Baked):
         return None
-    if not model.form.wall_px and not {f"{name}.webp", f"{name}.npy"} & _contents():
+    if not model.form.wall_px and f"{name}.npy" not in _contents():
         return None
-    texture = replace(model.texture, base=RED_PAINT)
-    return replace(
-        model, name=name, texture=texture, form=replace(model.form, name=name, texture=texture)
-    )
+    texture = replace(model.form.texture, base=RED_PAINT)
+    form = replace(model.form, name=name, texture=texture)
+    return replace(model, name=name, texture=texture, form=form)
 
 
 def get_object(name: str) -> ObjectModel:
@@ -240,7 +244,8 @@ def get_object(name: str) -> ObjectModel:
     """
     if name in BAKED:
         return BAKED[name]
-    for find in (_red, *MAKERS):
+    finders: list[Maker] = [_red, *MAKERS]
+    for find in finders:
         model = find(name)
         if model is not None:
             return model
