@@ -1,19 +1,24 @@
 """Photos and videos from outside, decoded within one limit of pixels."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
+from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.errors import BadOutput, BadPhoto
-from vap_core.base.files import check_regular, file_fault, replacing
+from vap_core.base.files import file_fault, replacing
 from vap_core.base.types import Mask, Rgb
+
+if TYPE_CHECKING:
+    import av
+    from PIL import Image
 
 PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "AVIF")
 """What Pillow may open of files from outside.
@@ -44,7 +49,7 @@ def load_photo(path: Path | str, long_side: int | None = LONG_SIDE) -> Rgb:
     Raises:
         BadPhoto: missing, unreadable, empty, not an image, truncated, or more than 50 megapixels.
     """
-    rgb = _decode(path, "RGB")
+    rgb = _photo(path, "RGB")
     return rgb if long_side is None else shrink(rgb, long_side)
 
 
@@ -62,36 +67,63 @@ def load_mask(path: Path | str) -> Mask:
 
     What is transparent is not the object. Raises: BadPhoto.
     """
-    pixels = _decode(path, "RGBA")
-    bright = pixels[..., :3].mean(axis=2) > BRIGHT
-    return bright & (pixels[..., 3] > BRIGHT)
+    pixels = _photo(path, "RGBA")
+    total = pixels[..., 0].astype(np.uint16)
+    total += pixels[..., 1]
+    total += pixels[..., 2]
+    return (total > 3 * BRIGHT) & (pixels[..., 3] > BRIGHT)
 
 
-def _decode(path: Path | str, mode: str) -> np.ndarray:
-    """The pixels of a picture file, upright, as RGB or RGBA. Raises: BadPhoto."""
-    from PIL import Image, ImageOps, UnidentifiedImageError
+def _photo(path: Path | str, mode: str) -> np.ndarray:
+    """The pixels of a photo's file, upright, as RGB or RGBA. Raises: BadPhoto."""
     from pillow_heif import register_heif_opener
 
     path = Path(path)
-    _check_file(path)
+    fault = file_fault(path)
+    if fault:
+        raise BadPhoto(f"load_photo: {path} {fault}; check the path and its permissions.")
+    size = path.stat().st_size
+    if not size:
+        raise BadPhoto(f"load_photo: {path} is empty; export the photo again.")
+    if size > MAX_BYTES:
+        raise BadPhoto(
+            f"load_photo: {path} has {size / 1e6:.0f} MB, over {MAX_BYTES / 1e6:.0f}; save it "
+            "smaller."
+        )
     register_heif_opener(thumbnails=False)
+    with path.open("rb") as file:
+        return decode_picture(file, f"load_photo: {path}", mode, PHOTO_FORMATS)
+
+
+def decode_picture(
+    source: BytesIO | BufferedReader,
+    name: str,
+    mode: str = "RGB",
+    formats: tuple[str, ...] = PICTURE_FORMATS,
+) -> np.ndarray:
+    """The pixels of a picture from outside, upright and in sRGB, h x w x 3 or 4, uint8.
+
+    Every picture that is decoded passes here: those of users, and those inside recordings and
+    meshes. `name` says in errors whose it is; `formats` are Pillow's names.
+
+    Raises: BadPhoto: no picture of these formats, damaged, over MAX_PIXELS, or of more than 8 bits.
+    """
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    over = f"pixels, over {MAX_PIXELS / 1e6:.0f} million; scale it down."
     try:
         with (
             warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning),
-            path.open("rb") as file,
-            Image.open(file, formats=PHOTO_FORMATS) as image,
+            Image.open(source, formats=formats) as image,
         ):
             if image.width * image.height > MAX_PIXELS:
-                raise BadPhoto(
-                    f"load_photo: {path} has {image.width}x{image.height} pixels, over "
-                    f"{MAX_PIXELS / 1e6:.0f} million; scale it down."
-                )
+                raise BadPhoto(f"{name} has {image.width}x{image.height} {over}")
             if image.mode.startswith(("I", "F")):
                 raise BadPhoto(
-                    f"load_photo: {path} has {image.mode} pixels, more than 8 bits each; save it "
-                    "as an 8-bit JPEG or PNG."
+                    f"{name} has {image.mode} pixels, more than 8 bits each; save it as an 8-bit "
+                    "JPEG or PNG."
                 )
-            upright = ImageOps.exif_transpose(image)
+            upright = _in_srgb(ImageOps.exif_transpose(image))
             if mode == "RGB" and upright.has_transparency_data:
                 # What is hidden in the file is no part of the picture.
                 grey = Image.new("RGBA", upright.size, (BEHIND, BEHIND, BEHIND, 255))
@@ -101,18 +133,42 @@ def _decode(path: Path | str, mode: str) -> np.ndarray:
         raise
     except UnidentifiedImageError as error:
         raise BadPhoto(
-            f"load_photo: {path} cannot be read as an image, it is none of "
-            f"{', '.join(PHOTO_FORMATS)}; export it as JPEG or PNG."
+            f"{name} cannot be read as an image, it is none of {', '.join(formats)}; export it as "
+            "JPEG or PNG."
         ) from error
     except Image.DecompressionBombError as error:
-        raise BadPhoto(
-            f"load_photo: {path} has over {MAX_PIXELS / 1e6:.0f} million pixels; scale it down."
-        ) from error
+        raise BadPhoto(f"{name} has too many {over}") from error
     except Exception as error:  # a damaged file makes the decoders raise anything
         raise BadPhoto(
-            f"load_photo: {path} cannot be read as an image ({error!s:.150}); export it as JPEG or "
-            "PNG."
+            f"{name} cannot be read as an image ({error!s:.150}); export it as JPEG or PNG."
         ) from error
+
+
+def _in_srgb(image: "Image.Image") -> "Image.Image":
+    """The picture with its colours as sRGB says them, by the ICC profile in its file.
+
+    A profile that cannot be read says nothing.
+    """
+    from PIL import Image, ImageCms
+
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return image
+    alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
+    if image.mode not in ("L", "CMYK", "LAB"):
+        image = image.convert("RGB")
+    try:
+        given = ImageCms.ImageCmsProfile(BytesIO(profile))
+        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+        srgb = ImageCms.createProfile("sRGB")
+        found = ImageCms.profileToProfile(image, given, srgb, intent, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        found = image
+    assert isinstance(found, Image.Image)
+    if alpha is not None:
+        found = found.convert("RGB")
+        found.putalpha(alpha)
+    return found
 
 
 def photos_in(folder: Path) -> list[Path]:
@@ -136,20 +192,6 @@ def photos_in(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _check_file(path: Path) -> None:
-    fault = file_fault(path)
-    if fault:
-        raise BadPhoto(f"load_photo: {path} {fault}; check the path and its permissions.")
-    size = path.stat().st_size
-    if not size:
-        raise BadPhoto(f"load_photo: {path} is empty; export the photo again.")
-    if size > MAX_BYTES:
-        raise BadPhoto(
-            f"load_photo: {path} has {size / 1e6:.0f} MB, over {MAX_BYTES / 1e6:.0f}; save it "
-            "smaller."
-        )
-
-
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 MAX_FRAMES = 3600
 """Two minutes at 30 frames a second: longer clips are read so far."""
@@ -164,26 +206,79 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+"""FFmpeg's names of what may be opened. Others of its formats are lists that name further files."""
+MAX_VIDEO_PIXELS = 4096 * 2304
+"""A frame: 4K."""
+
+
 def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
     """The frames of a video, upright, shrunk to `long_side` pixels where longer.
 
-    Raises: BadPhoto: the file is missing or unreadable, or holds no video that can be decoded.
+    Raises: BadPhoto: the file is missing, unreadable, over MAX_VIDEO_PIXELS, or holds no video
+        that can be decoded.
     """
+    with _opened(path) as container:
+        for number, frame in enumerate(container.decode(video=0)):
+            if number >= MAX_FRAMES:
+                return
+            yield _picture(frame, long_side)
+
+
+@contextmanager
+def _opened(path: Path) -> "Iterator[av.container.InputContainer]":
+    """Inside, a video of one of CONTAINERS is read. Raises: BadPhoto."""
     import av
 
     fault = file_fault(path)
     if fault:
         raise BadPhoto(f"video: {path} {fault}; check the path and its permissions.")
+    options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     try:
-        with av.open(str(path)) as container:
+        with av.open(f"file:{path}", options=options) as container:
             if not container.streams.video:
                 raise BadPhoto(f"video: {path} holds no video; export the clip as MP4.")
-            for number, frame in enumerate(container.decode(video=0)):
-                if number >= MAX_FRAMES:
-                    return
-                yield _picture(frame, long_side)
+            codec = container.streams.video[0].codec_context
+            if codec.width * codec.height > MAX_VIDEO_PIXELS:
+                raise BadPhoto(
+                    f"video: {path} has {codec.width}x{codec.height} pixels a frame, over "
+                    f"{MAX_VIDEO_PIXELS / 1e6:.1f} million; export the clip in 4K or less."
+                )
+            codec.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}  # a later frame may be larger
+            yield container
     except (av.FFmpegError, ValueError) as error:
-        raise _undecodable(path, error) from error
+        raise BadPhoto(
+            f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4."
+        ) from error
+
+
+def decode_video(packets: Sequence[np.ndarray], codec: str, name: str) -> list[Rgb]:
+    """The pictures of a stream of packets, one of each. `name` says in errors whose it is.
+
+    Raises: BadPhoto: a packet cannot be decoded, is over MAX_VIDEO_PIXELS, or holds none or several
+        pictures.
+    """
+    import av
+
+    context: Any = av.CodecContext.create(codec, "r")
+    context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+    pictures = []
+    try:
+        for data in [*packets, None]:
+            packet = None if data is None else av.Packet(data.tobytes())
+            for frame in context.decode(packet):
+                pictures.append(frame.to_ndarray(format="rgb24"))
+    except (av.FFmpegError, ValueError) as error:
+        raise BadPhoto(
+            f"{name} holds a video that cannot be decoded ({error!s:.120}; at most "
+            f"{MAX_VIDEO_PIXELS / 1e6:.1f} million pixels a picture)."
+        ) from error
+    if len(pictures) != len(packets):
+        raise BadPhoto(
+            f"{name} holds a video of {len(packets)} packets that decodes to {len(pictures)} "
+            "pictures."
+        )
+    return pictures
 
 
 def sharp_frames(path: Path, count: int) -> list[Rgb]:
@@ -273,19 +368,8 @@ class Mp4:
 
 def frame_rate(path: Path) -> float:
     """Frames a second of a video. Raises: BadPhoto."""
-    import av
-
-    try:
-        check_regular(path)
-        with av.open(str(path)) as container:
-            hz = container.streams.video[0].average_rate
-    except (av.FFmpegError, IndexError, OSError) as error:
-        raise _undecodable(path, error) from error
-    return float(hz or USUAL_HZ)
-
-
-def _undecodable(path: Path, error: Exception) -> BadPhoto:
-    return BadPhoto(f"video: {path} cannot be decoded ({error!s:.120}); export the clip as MP4.")
+    with _opened(path) as container:
+        return float(container.streams.video[0].average_rate or USUAL_HZ)
 
 
 def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:

@@ -1,17 +1,18 @@
 """Reading recordings back: their chunks and their properties."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from io import BytesIO
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
-import cv2
 import numpy as np
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from vap_core.base.errors import BadRecording
+from vap_core.base.errors import BadPhoto, BadRecording
 from vap_core.base.files import check_regular
+from vap_core.base.media import decode_picture, decode_video
 from vap_core.base.types import Rgb
 from vap_core.recording.colours import image_root
 
@@ -139,7 +140,7 @@ def by_camera(entities: Iterable[str]) -> dict[str, str]:
 def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
     """The pictures of some entities, by entity and control step.
 
-    Raises: BadRecording, for a JPEG or a video that cannot be decoded whole.
+    Raises: BadRecording, for a JPEG or a video that cannot be decoded whole, or is too large.
     """
     jpegs: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
     packets: dict[str, dict[int, Any]] = {entity: {} for entity in entities}
@@ -156,46 +157,16 @@ def read_pictures(path: Path, entities: set[str]) -> dict[str, dict[int, Rgb]]:
                     blob = np.asarray(cell.values.flatten().to_numpy(), np.uint8)
                     kept[chunk.entity_path][step] = blob
     pictures = {}
-    for entity in entities:
-        pictures[entity] = {step: _decode_jpeg(blob) for step, blob in jpegs[entity].items()}
-        if packets[entity]:
-            in_order = dict(sorted(packets[entity].items()))
-            decoded = _decode_video(list(in_order.values()))
-            pictures[entity] = dict(zip(in_order, decoded, strict=True))
-    return pictures
-
-
-def _decode_jpeg(blob: np.ndarray) -> Rgb:
-    bgr: Any = cv2.imdecode(blob, cv2.IMREAD_COLOR) if blob.size else None
-    if bgr is None:
-        raise BadRecording(
-            "pictures: the recording holds a picture that is no JPEG; record the episode again."
-        )
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8)
-
-
-def _decode_video(packets: Sequence[np.ndarray]) -> list[Rgb]:
-    """The pictures of an AV1 stream, one of each packet.
-
-    Raises: BadRecording, when a packet cannot be decoded, or holds none or several pictures.
-    """
-    import av
-
-    codec: Any = av.CodecContext.create("libdav1d", "r")
-    pictures = []
     try:
-        for data in [*packets, None]:
-            packet = None if data is None else av.Packet(data.tobytes())
-            for frame in codec.decode(packet):
-                pictures.append(frame.to_ndarray(format="rgb24"))
-    except (av.FFmpegError, ValueError) as error:
-        raise BadRecording(
-            f"pictures: the recording holds a video that cannot be decoded ({error}); "
-            "record the episode again."
-        ) from error
-    if len(pictures) != len(packets):
-        raise BadRecording(
-            f"pictures: the recording holds a video of {len(packets)} steps that decodes to "
-            f"{len(pictures)} pictures; record the episode again."
-        )
+        for entity in entities:
+            pictures[entity] = {
+                step: decode_picture(BytesIO(blob.tobytes()), str(path), formats=("JPEG",))
+                for step, blob in jpegs[entity].items()
+            }
+            if packets[entity]:
+                in_order = dict(sorted(packets[entity].items()))
+                decoded = decode_video(list(in_order.values()), "libdav1d", str(path))
+                pictures[entity] = dict(zip(in_order, decoded, strict=True))
+    except BadPhoto as error:
+        raise BadRecording(f"pictures: {error} Record the episode again.") from error
     return pictures

@@ -1,0 +1,202 @@
+"""Pictures and videos from outside: one limit, their own colours, and no further file."""
+
+import os
+import struct
+import time
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import rerun as rr
+from PIL import Image
+
+from tests.command import refused
+from vap_core.base.errors import BadPhoto, BadRecording
+from vap_core.base.media import frame_rate, frames, load_mask, load_photo
+from vap_core.recording.read import read_pictures
+from vap_core.recording.stream import finish_stream, log_row, open_stream, time_columns
+
+SRGB = np.array(
+    [[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]]
+)
+"""Colorants of sRGB as columns, D50; below those of three wider spaces, with their gamma."""
+SPACES = {
+    "Display P3": (
+        [[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]],
+        2.2,
+    ),
+    "Adobe RGB": (
+        [[0.60974, 0.20528, 0.14919], [0.31111, 0.62567, 0.06322], [0.01947, 0.06087, 0.74457]],
+        2.2,
+    ),
+    "ProPhoto RGB": (
+        [[0.79767, 0.13519, 0.03135], [0.28804, 0.71187, 0.00009], [0.0, 0.0, 0.82521]],
+        1.8,
+    ),
+}
+
+
+def icc(colorants: np.ndarray, gamma: float) -> bytes:
+    """A profile of a display: ICC.1, version 2."""
+
+    def fixed(values: np.ndarray) -> bytes:
+        return struct.pack(f">{len(values)}i", *np.round(65536 * values).astype(int).tolist())
+
+    curve = b"curv" + bytes(4) + struct.pack(">IH", 1, round(256 * gamma)) + bytes(2)
+    text = b"text" + bytes(4) + b"none\0\0\0\0"
+    name = b"desc" + bytes(4) + struct.pack(">I", 5) + b"test\0" + bytes(78)
+    tags = {b"desc": name, b"cprt": text, b"wtpt": b"XYZ " + bytes(4) + fixed(colorants.sum(1))}
+    for i, colour in enumerate((b"r", b"g", b"b")):
+        tags[colour + b"XYZ"] = b"XYZ " + bytes(4) + fixed(colorants[:, i])
+        tags[colour + b"TRC"] = curve
+    table, data, at = b"", b"", 132 + 12 * len(tags)
+    for tag, entry in tags.items():
+        padded = entry + bytes(-len(entry) % 4)
+        table += tag + struct.pack(">II", at + len(data), len(entry))
+        data += padded
+    head = struct.pack(
+        ">I4sI4s4s4s", at + len(data), b"none", 0x02400000, b"mntr", b"RGB ", b"XYZ "
+    )
+    head += bytes(12) + b"acsp" + bytes(28) + fixed(np.array([0.9642, 1.0, 0.8249])) + bytes(48)
+    return head + struct.pack(">I", len(tags)) + table + data
+
+
+def as_srgb(rgb: np.ndarray, colorants: np.ndarray, gamma: float) -> np.ndarray:
+    """What a colour of a space is in sRGB, by the definition of both."""
+    linear = np.linalg.solve(SRGB, colorants @ (rgb / 255) ** gamma).clip(0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.asarray(255 * encoded)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
+def test_the_profile_of_a_photo_is_applied(tmp_path: Path, space: str, mode: str) -> None:
+    colorants, gamma = np.array(SPACES[space][0]), SPACES[space][1]
+    for colour in ((128, 128, 128), (180, 120, 90), (110, 140, 100), (100, 110, 150)):
+        path = tmp_path / "photo.png"
+        picture = Image.new("RGB", (8, 8), colour)
+        picture = picture.quantize() if mode == "P" else picture.convert(mode)
+        picture.save(path, icc_profile=icc(colorants, gamma))
+        expected = as_srgb(np.array(colour, float), colorants, gamma)
+        assert np.abs(load_photo(path)[4, 4] - expected).max() <= 2, colour
+
+
+def test_a_damaged_profile_says_nothing(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8), (180, 120, 90)).save(tmp_path / "a.png", icc_profile=b"no profile")
+    assert load_photo(tmp_path / "a.png")[4, 4].tolist() == [180, 120, 90]
+
+
+def claims(side: int) -> bytes:
+    """A small JPEG that says that it has side x side pixels."""
+    whole = BytesIO()
+    Image.new("RGB", (16, 16)).save(whole, "JPEG")
+    data = bytearray(whole.getvalue())
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">HH", side, side)
+    return bytes(data)
+
+
+def film(path: Path, side: int, codec: str, n: int = 3, **options: str) -> list[bytes]:
+    """A video of grey frames, and its packets."""
+    packets = []
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10, options=options)
+        stream.width = stream.height = side
+        stream.pix_fmt = "yuv420p"
+        for _ in range(n):
+            frame = av.VideoFrame(side, side, "yuv420p")
+            for plane in frame.planes:
+                plane.update(bytes([128]) * plane.buffer_size)
+            packets += stream.encode(frame)
+        packets += stream.encode(None)
+        found = [bytes(packet) for packet in packets]
+        container.mux(packets)
+    return found
+
+
+def recording(path: Path, archetypes: list[rr.AsComponents]) -> Path:
+    rec = open_stream(path, "test")
+    for i, archetype in enumerate(archetypes):
+        entity = "/observation.images.front/prompted"
+        log_row(rec, entity, archetype, at=time_columns([(i, i / 10)]))
+    finish_stream(rec, path)
+    return path
+
+
+@pytest.mark.parametrize("side", [8000, 20_000, 60_000])
+def test_a_picture_inside_a_recording_has_the_limit_of_photos(tmp_path: Path, side: int) -> None:
+    """60,000 squared ended `view --mp4` and `report`; 20,000 squared took 6 GB."""
+    blob = claims(side)
+    (tmp_path / "a.jpg").write_bytes(blob)
+    with pytest.raises(BadPhoto, match=r"a\.jpg has .*pixels, over 50 million"):
+        load_photo(tmp_path / "a.jpg")
+    stills = [rr.EncodedImage(contents=blob, media_type="image/jpeg")] * 3
+    path = recording(tmp_path / "big.rrd", stills)
+    with pytest.raises(BadRecording, match=r"big\.rrd has .*pixels, over 50 million"):
+        read_pictures(path, {"/observation.images.front/prompted"})
+    assert "over 50 million" in refused("view", path, "--mp4", tmp_path / "out.mp4")
+    assert not (tmp_path / "out.mp4").exists()
+
+
+def test_a_video_has_a_limit_in_a_file_and_in_a_recording(tmp_path: Path) -> None:
+    fast = {"preset": "ultrafast"}
+    film(tmp_path / "large.mp4", 4096, "libx264", **fast)
+    for read in (lambda path: list(frames(path)), frame_rate):
+        with pytest.raises(BadPhoto, match=r"large\.mp4 has 4096x4096 pixels a frame, over 9\.4 m"):
+            read(tmp_path / "large.mp4")
+    packets = film(tmp_path / "av1.mp4", 4096, "libsvtav1", preset="13")
+    streams: list[rr.AsComponents] = [
+        rr.VideoStream(codec=rr.VideoCodec.AV1, sample=packet) for packet in packets
+    ]
+    with pytest.raises(BadRecording, match=r"large\.rrd holds a video .*at most 9\.4 million"):
+        read_pictures(
+            recording(tmp_path / "large.rrd", streams), {"/observation.images.front/prompted"}
+        )
+    film(tmp_path / "small.mp4", 64, "libx264", **fast)
+    assert [rgb.shape for rgb in frames(tmp_path / "small.mp4")] == [(64, 64, 3)] * 3
+
+
+LISTS: dict[str, Callable[[str], str]] = {
+    "ffconcat": lambda name: f"ffconcat version 1.0\nfile {name}\n",
+    "m3u8": lambda name: f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{name}\n#EXT-X-ENDLIST\n",
+    "mpd": lambda name: (
+        f'<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011">{name}</MPD>'
+    ),
+    "sdp": lambda name: "v=0\nc=IN IP4 127.0.0.1\nm=video 5000 RTP/AVP 96\n",
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("kind", LISTS)
+def test_a_list_of_files_is_no_video(tmp_path: Path, kind: str) -> None:
+    """One opened its neighbours, and waited for a pipe."""
+    film(tmp_path / "neighbour.mp4", 64, "libx264")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("neighbour.mp4", "pipe"):
+        (tmp_path / "clip.mp4").write_text(LISTS[kind](name))
+        with pytest.raises(BadPhoto, match=r"clip\.mp4 cannot be decoded"):
+            list(frames(tmp_path / "clip.mp4"))
+
+
+def test_a_file_named_like_a_protocol_is_a_file(tmp_path: Path) -> None:
+    film(tmp_path / "a.mp4", 64, "libx264")
+    (tmp_path / "a.mp4").rename(tmp_path / "concat:a|b.mp4")
+    assert len(list(frames(tmp_path / "concat:a|b.mp4"))) == 3
+
+
+def test_a_mask_of_49_megapixels_is_read_in_seconds(tmp_path: Path) -> None:
+    """It took 27 s; a photo of as many pixels is the yardstick."""
+    pixels = np.zeros((7000, 7000, 3), np.uint8)
+    pixels[2000:4000, 1000:3000] = (255, 255, 0)
+    pixels[5000:, :, 0] = 255
+    Image.fromarray(pixels).save(tmp_path / "mask.png", compress_level=1)
+    seconds = []
+    for load in (load_photo, load_mask):
+        began = time.process_time()
+        found = load(tmp_path / "mask.png")
+        seconds.append(time.process_time() - began)
+    assert found.sum() == 2000 * 2000
+    assert seconds[1] < 4 * seconds[0]
