@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
+from safetensors.torch import load_file, save_file
 
 from tests.command import process, refused, vap
 from vap_core.base.errors import BadOutput, VapError
@@ -16,6 +18,7 @@ from vap_core.cli.command import names
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study.report import rescore
 from vap_core.study.store import read
+from vap_core.study.trials import shipped
 
 SUITE = "simpler-bridge"
 TASKS = [task.name for task in BENCHMARKS[SUITE].tasks]
@@ -252,3 +255,18 @@ def test_what_makes_no_sense_is_refused_in_one_line(
     assert re.search(f"(?i)^error: .*{said}", last), done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists(), "nothing begun, nothing left behind"
+
+
+def test_a_run_of_errors_alone_is_no_success(tmp_path: Path) -> None:
+    """It said how many errors there were, and exited with 0."""
+    policy = shutil.copytree(shipped("simpler-bridge"), tmp_path / "policy")
+    weights = load_file(policy / "model.safetensors")
+    name = next(name for name in weights if name.endswith("action_out_proj.bias"))
+    weights[name] = torch.full_like(weights[name], torch.inf)
+    save_file(weights, policy / "model.safetensors")
+    row = ("--suite", "simpler-bridge", "--task", "put-camera", "--episodes", "1")
+    words = ("eval", *row, "--policy", policy, "--retries", "0", "--out", tmp_path / "run")
+    line = refused(*words)
+    assert "every one of the 2 episodes" in line
+    assert "of 2 of them: " in line
+    assert "finite" in line

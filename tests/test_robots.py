@@ -1,14 +1,17 @@
 """The authored robots: forward kinematics, limits and strokes against the Menagerie models, and inverse kinematics that reaches."""
 
 import os
+import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vap_core.base.errors import OutOfReach, UnknownName
-from vap_core.simulation import robots
+from vap_core.base.errors import MissingGL, OutOfReach, UnknownName
+from vap_core.simulation import gl, robots
 from vap_core.simulation.control import (
     MotionLimits,
     Setpoint,
@@ -187,24 +190,43 @@ def test_unknown_robot_lists_the_known_ones():
         robots.get("pr2")
 
 
-def test_missing_gl_names_the_line_to_run(monkeypatch):
-    from vap_core.base.errors import MissingGL
-    from vap_core.simulation import gl
-
+def test_missing_gl_names_the_cause_and_the_line_to_run(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "works", lambda backend: False)
-    with pytest.raises(MissingGL, match=REMEDY):
+    monkeypatch.delenv(gl.PROVEN, raising=False)
+    monkeypatch.setattr(gl, "fault", lambda backend: f"no {backend} here")
+    with pytest.raises(MissingGL, match=f"egl: no egl here; osmesa: no osmesa here.*{REMEDY}"):
         ensure_gl()
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    with pytest.raises(MissingGL, match="MUJOCO_GL=osmesa cannot draw.*Unset it"):
+    with pytest.raises(MissingGL, match="MUJOCO_GL=osmesa cannot draw.*unset MUJOCO_GL"):
         ensure_gl()
 
 
 def test_a_back_end_that_works_is_kept_and_probed_once(monkeypatch):
-    from vap_core.simulation import gl
-
     asked = []
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.delenv(gl.PROVEN, raising=False)
-    monkeypatch.setattr(gl, "works", lambda backend: not asked.append(backend))
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
+    monkeypatch.setattr(gl, "fault", asked.append)
     assert (ensure_gl(), ensure_gl(), asked) == ("osmesa", "osmesa", ["osmesa"])
+    assert os.environ["PYOPENGL_PLATFORM"] == "osmesa"
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "words"),
+    [
+        ("PYOPENGL_PLATFORM", "osmesa", ""),
+        ("PYOPENGL_PLATFORM", "glx", ""),
+        ("MUJOCO_EGL_DEVICE_ID", "97", "MUJOCO_EGL_DEVICE_ID.*must be an integer.*unset MUJOCO_EGL"),
+        ("MUJOCO_GL", "nonsense", "invalid value for environment variable MUJOCO_GL: nonsense"),
+    ],
+)  # fmt: skip
+def test_the_probe_says_what_the_run_will_meet(variable, value, words):
+    """With PYOPENGL_PLATFORM the probe passed and every episode was an error."""
+    code = "from vap_core.simulation.env import Env; from vap_core import open_row\n"
+    code += "from vap_core.simulation import suites\n"
+    code += "with open_row(suites.rows('simpler-bridge', 'put-camera')[0]) as env: env.observe()"
+    kept = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", gl.PROVEN)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env={**kept, variable: value}, capture_output=True, text=True)
+    assert (done.returncode == 0) == (not words), done.stderr
+    assert re.search(words, done.stderr.strip().splitlines()[-1] if words else "")

@@ -476,3 +476,9 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
         from vap_core.study.logs import verdict
 
         print("\n" + verdict(out))
+    if len(table) and (table["outcome"] == "error").all():
+        causes = table["detail"].fillna("").str.strip().str.split("\n").str[-1].value_counts()
+        raise BadStudy(
+            f"every one of the {len(table)} episodes in {out} is an error; of {causes.iloc[0]} of "
+            f"them: {causes.index[0]}. Mend that and run the same command again."
+        )

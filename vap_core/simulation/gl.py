@@ -18,8 +18,6 @@ PROVEN = "VAP_CORE_GL"
 REMEDY = "apt-get install -y --no-install-recommends libegl1 libgl1"
 _PROBE = """
 import os
-os.environ["MUJOCO_GL"] = {backend!r}
-os.environ.pop("PYOPENGL_PLATFORM", None)
 import mujoco
 context = mujoco.GLContext(16, 16)
 context.make_current()
@@ -29,9 +27,18 @@ os._exit(0)
 """
 
 
+def settings(backend: str) -> dict[str, str]:
+    """The variables that make MuJoCo draw with `backend`: those of the probe are those of the run.
+
+    PyOpenGL's has to agree with MuJoCo's, whatever was set before.
+    """
+    found = {"MUJOCO_GL": backend, PROVEN: backend}
+    return found | ({"PYOPENGL_PLATFORM": backend} if backend in BACKENDS else {})
+
+
 @cache
-def works(backend: str) -> bool:
-    """Whether `backend` can make a context here.
+def fault(backend: str) -> str | None:
+    """Why `backend` can make no context here, as MuJoCo says it; None when it can.
 
     A child process tries it, so that a crash in a driver does not end this one.
 
@@ -42,42 +49,49 @@ def works(backend: str) -> bool:
             "ensure_gl: the package mujoco is not installed. Run: pip install -r environment.txt"
         )
     probe = subprocess.run(
-        [sys.executable, "-c", _PROBE.format(backend=backend)],
+        [sys.executable, "-c", _PROBE],
+        env={**os.environ, **settings(backend)},
         capture_output=True,
+        text=True,
         check=False,
         timeout=120,
     )
-    return probe.returncode == 0
+    if probe.returncode == 0:
+        return None
+    lines = [line for line in probe.stderr.splitlines() if line and not line.startswith(" ")]
+    # While it is taken down, PyOpenGL may fail once more.
+    said = [line for line in lines if "Error" in line and "__del__" not in line]
+    return (said or lines or [f"the driver ended the process with {probe.returncode}"])[0][:300]
 
 
 def ensure_gl() -> str:
-    """Set `MUJOCO_GL` to a back end that draws without a display here, and return its name.
+    """Set the variables of a back end that draws without a display here, and return its name.
 
     Call it before importing mujoco where possible; a mujoco that is already imported is switched
     over. A back end that the user set is probed and kept; one that this process or its parent found
     to work is not probed again.
 
-    Raises: MissingGL with the line to run.
+    Raises: MissingGL with the cause that MuJoCo gives, and the line to run.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if chosen and (os.environ.get(PROVEN) == chosen or works(chosen)):
-        os.environ[PROVEN] = chosen
-        return chosen
-    if chosen:
-        raise MissingGL(
-            f"ensure_gl: MUJOCO_GL={chosen} cannot draw on this machine. Unset it, or run: {REMEDY}"
-        )
-    for backend in BACKENDS:
-        if works(backend):
-            os.environ["MUJOCO_GL"] = backend
-            os.environ[PROVEN] = backend
-            if "mujoco" in sys.modules:
-                context = importlib.import_module("mujoco.rendering.classic.gl_context")
-                importlib.reload(context)
-            return backend
+    causes = {}
+    for backend in (chosen,) if chosen else BACKENDS:
+        if os.environ.get(PROVEN) != backend:
+            cause = fault(backend)
+            if cause is not None:
+                causes[backend] = cause
+                continue
+        os.environ.update(settings(backend))
+        if not chosen and "mujoco" in sys.modules:
+            importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
+        return backend
+    said = "; ".join(f"{backend}: {cause}" for backend, cause in causes.items())
+    what = f"MUJOCO_GL={chosen}" if chosen else f"no back end of {', '.join(BACKENDS)}"
+    unset = " unset MUJOCO_GL, or" if chosen else ""
+    device = " unset MUJOCO_EGL_DEVICE_ID, or" if "MUJOCO_EGL_DEVICE_ID" in os.environ else ""
     raise MissingGL(
-        f"ensure_gl: no OpenGL back end of {', '.join(BACKENDS)} can draw without a display. "
-        f"Run: {REMEDY}"
+        f"ensure_gl: {what} {'cannot' if chosen else 'can'} draw without a display ({said}). "
+        f"Mend what is named there;{unset}{device} run: {REMEDY}"
     )
 
 
