@@ -15,7 +15,7 @@ from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.cli import machine
 from vap_core.perception import protocols, stacks
-from vap_core.perception.foundation import store
+from vap_core.perception.foundation import weights as hub
 from vap_core.perception.protocols import Stack, Thresholds
 from vap_core.simulation.assets import objects
 from vap_make.calibration import report, run, scenes
@@ -168,7 +168,7 @@ def test_keep_is_for_stacks_that_ship_none(tmp_path, monkeypatch):
     run.refuse_keep("foundation")
     run.refuse_keep("embedded", [tmp_path])
     monkeypatch.setattr(run, "load_stack", lambda name: TOY)
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     path = run.keep_choice("foundation", report.Choice(0.6, None))
     kept = protocols.read_thresholds(tmp_path, "foundation", TOY.encoder.name)
     assert path.parent == tmp_path
@@ -194,7 +194,7 @@ def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, m
     monkeypatch.setattr(stacks, "load_own", lambda name: judged)
     assert f"calibration --stack {name} --photos SET --keep" in ground.missing_threshold(name)
     monkeypatch.setattr(run, "load_stack", lambda name: judged)
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     with pytest.raises(BadOutput, match="more photos in the set"):
         run.keep_choice(name, report.Choice(0.6, None))
     run.keep_choice(name, report.Choice(0.6, 0.5))
@@ -233,7 +233,7 @@ def test_the_remedy_for_a_damaged_threshold_is_one_that_is_not_refused(name, tmp
 def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_path, monkeypatch):
     shipped = replace(TOY, thresholds=Thresholds(0.7, 0.5))
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: shipped)
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     assert stacks.load_own("toy").thresholds == Thresholds(0.7, 0.5)
     run.keep_choice("toy", report.Choice(0.9, 0.61))
     assert stacks.load_own("toy").thresholds == Thresholds(0.7, 0.61)
@@ -244,7 +244,7 @@ def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_pat
 
 def test_an_own_stack_without_thresholds_uses_what_was_kept(tmp_path, monkeypatch):
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     assert "calibration --stack toy --keep" in ground.missing_threshold("toy")
     run.refuse_keep("toy")
     run.keep_choice("toy", report.Choice(0.9, None))
@@ -290,7 +290,7 @@ def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
 
 
 def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeypatch):
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     finding = machine._not_in_view()
     assert not finding.works
     assert not finding.needed

@@ -14,8 +14,7 @@ import pytest
 from vap_core.base.errors import BadOutput, MissingWeights
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.embedded.networks import weights_sha256
-from vap_core.perception.foundation.sources import MODELS, TENSORS
-from vap_core.perception.foundation.store import LOCK, VARIABLE
+from vap_core.perception.foundation.weights import LOCK, MODELS, TENSORS, VARIABLE
 from vap_core.perception.protocols import Encoder, Stack, Thresholds, Tracker, keep_thresholds
 from vap_core.perception.stacks import STACKS, checksums, describe_parts
 from vap_core.study import objects as own_objects

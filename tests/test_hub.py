@@ -14,12 +14,11 @@ from tests import tiny_foundation
 from tests.command import vap
 from tests.local_server import running
 from vap_core.base.errors import MissingWeights, UnknownName
-from vap_core.perception.foundation import sources, store
-from vap_core.perception.foundation.sources import TENSORS, Source
-from vap_core.perception.foundation.store import LOCK, find_problem, pull
+from vap_core.perception.foundation import weights as hub
+from vap_core.perception.foundation.weights import LOCK, TENSORS, Source, find_problem, pull
 
 NAME = "dinov2-base"
-SOURCE = sources.MODELS[NAME]
+SOURCE = hub.MODELS[NAME]
 
 
 def silent(line: str) -> None:
@@ -38,7 +37,7 @@ def pinned(origin: Path, monkeypatch: pytest.MonkeyPatch) -> Source:
     """The model's pin, as it would be if the small file were the real one."""
     digest = hashlib.sha256((origin / SOURCE.repo / TENSORS).read_bytes()).hexdigest()
     small = Source(SOURCE.repo, SOURCE.revision, digest)
-    monkeypatch.setitem(sources.MODELS, NAME, small)
+    monkeypatch.setitem(hub.MODELS, NAME, small)
     return small
 
 
@@ -99,7 +98,7 @@ def serving(
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with Hub(origin, cuts, revision) as server:
         url = f"http://127.0.0.1:{server.server_port}"
-        monkeypatch.setenv(store.ENDPOINT_VARIABLE, url)
+        monkeypatch.setenv(hub.ENDPOINT_VARIABLE, url)
         with running(server):
             yield server
 
@@ -200,7 +199,7 @@ def test_no_network_is_one_line_that_names_the_other_way(
 ) -> None:
     monkeypatch.setattr("huggingface_hub.file_download.time.sleep", lambda seconds: None)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.setenv(store.ENDPOINT_VARIABLE, "http://127.0.0.1:9")
+    monkeypatch.setenv(hub.ENDPOINT_VARIABLE, "http://127.0.0.1:9")
     with pytest.raises(
         MissingWeights, match=r"http://127\.0\.0\.1:9/.* cannot be had \(.*refused.*--from"
     ) as caught:
@@ -322,10 +321,10 @@ def test_a_store_taken_in_place_needs_its_lock_only(
 def test_a_changed_file_is_noticed_before_it_is_loaded(
     origin: Path, tmp_path: Path, file: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sources.KINDS, "alone", (NAME,))
+    monkeypatch.setitem(hub.KINDS, "alone", (NAME,))
     place = tmp_path / "store"
     pull([NAME], place, origin=origin, unpinned=True, say=silent)
-    (weights,) = store.verify_stack("alone", place)
+    (weights,) = hub.verify_stack("alone", place)
     assert weights.folder == place / SOURCE.folder
     assert weights.identity.startswith(f"{NAME}-")
     assert json.loads((weights.folder / LOCK).read_text())["revision"] is None
@@ -336,21 +335,21 @@ def test_a_changed_file_is_noticed_before_it_is_loaded(
         MissingWeights,
         match=rf"--stack alone: {NAME} \(SHA-256 of {file} differs from lock.json\) not usable",
     ):
-        store.verify_stack("alone", place)
+        hub.verify_stack("alone", place)
 
 
 def test_pinned_weights_carry_the_models_name_and_sizes_differ(
     pinned: Source, origin: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sources.KINDS, "alone", (NAME,))
+    monkeypatch.setitem(hub.KINDS, "alone", (NAME,))
     pull([NAME], tmp_path / "store", origin=origin, say=silent)
-    assert store.verify_stack("alone", tmp_path / "store")[0].identity == NAME
+    assert hub.verify_stack("alone", tmp_path / "store")[0].identity == NAME
     assert (
         len(
             {
                 encoder
                 for _, encoder, _ in (
-                    sources.KINDS[kind] for kind in ("foundation", "foundation-small")
+                    hub.KINDS[kind] for kind in ("foundation", "foundation-small")
                 )
             }
         )
@@ -360,10 +359,10 @@ def test_pinned_weights_carry_the_models_name_and_sizes_differ(
 
 def test_pins_are_commits_and_hashes_of_safe_files() -> None:
     """The stacks' models are pinned; an option outside of them, which nobody has pulled here, is not."""
-    pinned = {name for models in sources.KINDS.values() for name in models} | {sources.TEXT}
-    options = {name for models in sources.PARTS.values() for name in models}
-    assert pinned | options == set(sources.MODELS)
-    for name, source in sources.MODELS.items():
+    pinned = {name for models in hub.KINDS.values() for name in models} | {hub.TEXT}
+    options = {name for models in hub.PARTS.values() for name in models}
+    assert pinned | options == set(hub.MODELS)
+    for name, source in hub.MODELS.items():
         assert all(Path(file).suffix in (".safetensors", ".json", ".txt") for file in source.files)
         if name not in pinned:
             assert (source.revision, source.sha256) == ("main", "")
@@ -371,16 +370,14 @@ def test_pins_are_commits_and_hashes_of_safe_files() -> None:
         assert len(source.revision) == 40
         assert len(source.sha256) == 64
         assert int(source.revision + source.sha256, 16)
-    assert sources.models_of("embedded") == (sources.TEXT,)
+    assert hub.models_of("embedded") == (hub.TEXT,)
     with pytest.raises(UnknownName, match="known: embedded, foundation, foundation-small"):
-        sources.models_of("huge")
+        hub.models_of("huge")
 
 
 def test_commands_pull_and_list(tmp_path: Path) -> None:
-    for name in sources.KINDS["foundation-small"]:
-        tiny_foundation.placeholder(
-            tmp_path / "usb" / sources.MODELS[name].folder, sources.MODELS[name]
-        )
+    for name in hub.KINDS["foundation-small"]:
+        tiny_foundation.placeholder(tmp_path / "usb" / hub.MODELS[name].folder, hub.MODELS[name])
     place = tmp_path / "store"
     done = vap(
         "weights",
@@ -390,14 +387,14 @@ def test_commands_pull_and_list(tmp_path: Path) -> None:
         "--from",
         tmp_path / "usb",
         "--unpinned",
-        env={store.VARIABLE: str(place)},
+        env={hub.VARIABLE: str(place)},
     )
     assert done.returncode == 0, done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == list(
-        sources.KINDS["foundation-small"]
+        hub.KINDS["foundation-small"]
     )
-    listed = vap("weights", "list", env={store.VARIABLE: str(place)})
-    assert listed.stdout == store.weights_table(place) + "\n"
+    listed = vap("weights", "list", env={hub.VARIABLE: str(place)})
+    assert listed.stdout == hub.weights_table(place) + "\n"
     assert (
         "facebook/sam2.1-hiera-large@665f8e2a: lacks config.json, model.safetensors"
         in listed.stdout

@@ -20,8 +20,15 @@ from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.foundation import models as crops
 from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
-from vap_core.perception.foundation.sources import KINDS, MODELS, PARTS, models_of, parts_of
-from vap_core.perception.foundation.store import pull, weights_table
+from vap_core.perception.foundation.weights import (
+    KINDS,
+    MODELS,
+    PARTS,
+    models_of,
+    parts_of,
+    pull,
+    weights_table,
+)
 from vap_core.perception.protocols import JudgedDetector, Thresholds, keep_thresholds
 from vap_core.perception.stacks import EMBEDDED_THRESHOLDS, check_stack, load_stack, mixed
 
@@ -173,7 +180,7 @@ def test_parts_mix_freely_and_thresholds_belong_to_detector_and_encoder(here: Pa
     embedded = load_stack("embedded")
     both = load_stack(mixed("embedded", detector="llmdet-tiny", encoder="siglip2-base"))
     assert isinstance(both.detector, JudgedDetector), "the embedded segmenter tells photos apart"
-    assert (type(both.detector.detector).__name__, type(both.encoder).__name__) == ("GroundingDino", "PooledEncoder")  # fmt: skip
+    assert (type(both.detector.detector).__name__, type(both.encoder).__name__) == ("GroundingDino", "CropEncoder")  # fmt: skip
     assert type(both.tracker) is type(embedded.tracker)
     assert both.unfamiliar_encoder is None
     assert both.category_detector is both.detector

@@ -11,7 +11,7 @@ from vap_core.base.errors import VapError
 from vap_core.base.files import read_file
 from vap_core.base.media import frame_rate, frames, load_photo
 from vap_core.memory import load as load_object
-from vap_core.perception.foundation.store import read_lock
+from vap_core.perception.foundation.weights import read_lock
 from vap_core.policies.lerobot.checkpoints import locate
 from vap_core.policies.mini_pi0.learned_token import load as load_token
 from vap_core.recording import read_summary

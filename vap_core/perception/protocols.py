@@ -261,7 +261,7 @@ def read_thresholds(folder: Path, kind: str, encoder: str) -> Thresholds | None:
 
     Raises: BadOutput: the file is damaged.
     """
-    from vap_core.perception.foundation.sources import needs_photos
+    from vap_core.perception.foundation.weights import needs_photos
 
     path = thresholds_file(folder, kind)
     if not path.is_file():

@@ -10,8 +10,8 @@ import numpy as np
 
 from vap_core.base.errors import check_device, one_of
 from vap_core.base.files import sha256_of, source_digest
-from vap_core.perception.foundation.sources import EMBEDDED, KINDS, parts_of
-from vap_core.perception.foundation.sources import mixed as mixed
+from vap_core.perception.foundation.weights import EMBEDDED, KINDS, parts_of
+from vap_core.perception.foundation.weights import mixed as mixed
 from vap_core.perception.protocols import Stack, Thresholds, Tracker
 
 
@@ -126,7 +126,7 @@ def load_own(name: str) -> Stack:
 
     Raises: as load_stack; BadOutput: the file of thresholds is damaged.
     """
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.weights import store_folder
     from vap_core.perception.protocols import read_thresholds
 
     stack = load_stack(name)
@@ -168,7 +168,7 @@ def checksums(name: str, kept: bool = True) -> dict[str, Any]:
         raises.
     """
     from vap_core.perception.embedded.networks import weights_sha256
-    from vap_core.perception.foundation.store import locked_sha256, store_folder
+    from vap_core.perception.foundation.weights import locked_sha256, store_folder
     from vap_core.perception.protocols import thresholds_file
 
     found: dict[str, Any] = {"weights": weights_sha256()}

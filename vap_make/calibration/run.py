@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from vap_core import __version__
 from vap_core.base.errors import BadOutput, BadPhotoSet
 from vap_core.base.files import read_parquet, write_atomic, writing
-from vap_core.perception.foundation.sources import needs_photos
-from vap_core.perception.foundation.store import store_folder
+from vap_core.perception.foundation.weights import needs_photos, store_folder
 from vap_core.perception.protocols import FamiliarityJudge, Stack, keep_command, keep_thresholds
 from vap_core.perception.stacks import checksums, is_own, load_stack, ships_thresholds
 from vap_core.study import store

@@ -21,7 +21,7 @@ from vap_core.base.errors import MissingWeights
 from vap_core.base.files import DATA, write_atomic
 from vap_core.base.types import Rgb
 from vap_core.perception import text_encoder
-from vap_core.perception.foundation.sources import TENSORS
+from vap_core.perception.foundation.weights import TENSORS
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.base.errors import device_name, require
-from vap_core.perception.foundation.sources import EMBEDDED, parts_of
+from vap_core.perception.foundation.weights import EMBEDDED, parts_of
 from vap_core.perception.protocols import Stack, Thresholds, read_thresholds
 
 
@@ -27,7 +27,7 @@ def load(kind: str, device: str | None = None, store: Path | None = None) -> Sta
         BadOutput: the file of thresholds is damaged.
     """
     require("foundation", f"the stack {kind}")
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.weights import store_folder
 
     store = store or store_folder()
     stack = _load_networks(kind, device_name(device), store)
@@ -48,8 +48,7 @@ def load_parts(name: str, device: str | None = None, store: Path | None = None) 
     require("foundation", f"the stack {name}")
     from vap_core.perception.foundation import architectures
     from vap_core.perception.foundation.models import select_runtime
-    from vap_core.perception.foundation.sources import models_of
-    from vap_core.perception.foundation.store import verify_stack
+    from vap_core.perception.foundation.weights import models_of, verify_stack
 
     runtime = select_runtime(device)
     weights = dict(zip(models_of(name), verify_stack(name, store), strict=True))
@@ -62,7 +61,7 @@ def load_parts(name: str, device: str | None = None, store: Path | None = None) 
 
 def kept_thresholds(name: str, encoder: str) -> Thresholds | None:
     """The thresholds of a mixed stack that were measured and kept. Raises: BadOutput."""
-    from vap_core.perception.foundation.store import store_folder
+    from vap_core.perception.foundation.weights import store_folder
 
     return read_thresholds(store_folder(), name, encoder)
 

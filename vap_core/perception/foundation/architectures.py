@@ -14,23 +14,20 @@ from vap_core.perception.foundation.models import (
     IMAGENET,
     SIGLIP,
     CropEncoder,
-    CropRecipe,
     GroundingDino,
     Normalisation,
-    PhraseDetector,
-    PooledEncoder,
     Runtime,
     Sam,
     Sam3Detector,
     SamSegmenter,
 )
-from vap_core.perception.foundation.store import VerifiedWeights
 from vap_core.perception.foundation.tracker import (
     REPVIT,
     EdgeTamTracker,
     SamTracker,
     backbone_without_hub,
 )
+from vap_core.perception.foundation.weights import VerifiedWeights
 
 CLASSES = {
     "detector": {
@@ -51,11 +48,7 @@ CLASSES = {
     },
 }
 """transformers' class by role, of the models whose names begin so."""
-ENCODERS: dict[str, tuple[type[CropEncoder], CropRecipe]] = {
-    "Dinov2Model": (CropEncoder, DINO),
-    "DINOv3ViTModel": (CropEncoder, DINOV3),
-    "SiglipVisionModel": (PooledEncoder, SIGLIP),
-}
+ENCODERS = {"Dinov2Model": DINO, "DINOv3ViTModel": DINOV3, "SiglipVisionModel": SIGLIP}
 TRACKERS: dict[str, tuple[type[SamTracker], Normalisation]] = {
     "Sam2VideoModel": (SamTracker, IMAGENET),
     "Sam3TrackerVideoModel": (SamTracker, CENTRED),
@@ -81,8 +74,28 @@ def read_part(role: str, model: str, weights: VerifiedWeights, runtime: Runtime)
     import transformers
 
     tokenizer = None
+    cls = getattr(transformers, network_class(role, model))
     with quiet_transformers(), backbone_without_hub():
-        network = _read_network(getattr(transformers, network_class(role, model)), weights)
+        try:
+            network, info = cls.from_pretrained(
+                weights.folder,
+                local_files_only=True,
+                use_safetensors=True,
+                dtype=torch.float32,
+                output_loading_info=True,
+            )
+        except (OSError, ValueError, RuntimeError, KeyError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0][:160]
+            raise MissingWeights(
+                f"foundation: {weights.folder} cannot be read as {cls.__name__} ({reason}); "
+                "pull it again."
+            ) from error
+        missing = sorted(info["missing_keys"])
+        if missing:
+            raise MissingWeights(
+                f"foundation: {weights.folder} lacks {len(missing)} tensors of {cls.__name__}, "
+                f"such as {missing[0]}; pull it again."
+            )
         if role == "detector":
             tokenizer = transformers.AutoTokenizer.from_pretrained(
                 weights.folder, local_files_only=True
@@ -99,29 +112,18 @@ def fill_part(
     """
     kind = type(network).__name__
     if role == "detector":
-        return {"detector": _detector(kind, network, tokenizer, runtime), "by_category": None}
+        detector = (
+            Sam3Detector(network, tokenizer, runtime)
+            if kind == "Sam3Model"
+            else GroundingDino(network, tokenizer, runtime)
+        )
+        return {"detector": detector, "by_category": None}
     if role == "encoder":
-        encoder, recipe = ENCODERS[kind]
-        filled = encoder(model=network, recipe=recipe, name=name, runtime=runtime)
-        return {"encoder": filled, "unfamiliar_encoder": None}
+        encoder = CropEncoder(network, ENCODERS[kind], name, runtime)
+        return {"encoder": encoder, "unfamiliar_encoder": None}
     tracker, normalisation = TRACKERS[kind]
     sam = Sam(network, runtime, normalisation)
     return {"segmenter": SamSegmenter(sam), "tracker": tracker(sam)}
-
-
-def _detector(kind: str, network: Any, tokenizer: Any, runtime: Runtime) -> PhraseDetector:
-    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
-        GroundingDinoImageProcessorPil,
-    )
-
-    if kind == "Sam3Model":
-        return Sam3Detector(network, tokenizer, runtime)
-    return GroundingDino(
-        model=network,
-        tokenizer=tokenizer,
-        processor=GroundingDinoImageProcessorPil(),
-        runtime=runtime,
-    )
 
 
 @contextmanager
@@ -139,34 +141,6 @@ def quiet_transformers() -> Iterator[None]:
         logging.set_verbosity(level)
         if bars:
             logging.enable_progress_bar()
-
-
-def _read_network(cls: Any, weights: VerifiedWeights) -> Any:
-    try:
-        network, info = cls.from_pretrained(
-            weights.folder,
-            local_files_only=True,
-            use_safetensors=True,
-            dtype=torch.float32,
-            output_loading_info=True,
-        )
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
-        raise MissingWeights(
-            f"foundation: {weights.folder} cannot be read as {cls.__name__} "
-            f"({_first_line(error)}); pull it again."
-        ) from error
-    missing = sorted(info["missing_keys"])
-    if missing:
-        raise MissingWeights(
-            f"foundation: {weights.folder} lacks {len(missing)} tensors of {cls.__name__}, "
-            f"such as {missing[0]}; pull it again."
-        )
-    return network
-
-
-def _first_line(error: Exception) -> str:
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0][:160]
 
 
 SWIN_BASE: dict[str, Any] = {
@@ -217,25 +191,19 @@ def published_config(name: str, model: str) -> Any:
 
     hf: Any = transformers  # its configurations take more than they declare
     match name:
-        case "GroundingDinoForObjectDetection":
-            return hf.GroundingDinoConfig(backbone_config=_swin(model))
-        case "MMGroundingDinoForObjectDetection":
-            return hf.MMGroundingDinoConfig(backbone_config=_swin(model))
-        case "Sam3Model":
-            return hf.Sam3Config()
+        case "GroundingDinoForObjectDetection" | "MMGroundingDinoForObjectDetection":
+            size = SWIN_BASE if model.endswith("-base") else SWIN_TINY
+            config = getattr(hf, name.replace("ForObjectDetection", "Config"))
+            return config(backbone_config=hf.SwinConfig(**size, out_indices=[2, 3, 4]))
         case "Dinov2Model":
             return hf.Dinov2Config(**VIT_SIZES[model], image_size=518)
         case "DINOv3ViTModel":
             return hf.DINOv3ViTConfig(num_register_tokens=4)
-        case "SiglipVisionModel":
-            return hf.SiglipVisionConfig()
         case "Sam2VideoModel":
             hiera = hf.Sam2HieraDetConfig(**HIERA_SIZES[model])
             channels = hiera.embed_dim_per_stage[::-1]
             vision = hf.Sam2VisionConfig(backbone_config=hiera, backbone_channel_list=channels)
             return hf.Sam2VideoConfig(vision_config=vision)
-        case "Sam3TrackerVideoModel":
-            return hf.Sam3TrackerVideoConfig()
         case "EdgeTamVideoModel":
             repvit = hf.TimmWrapperConfig(architecture="repvit_m1", model_args=REPVIT)
             return hf.EdgeTamVideoConfig(
@@ -243,16 +211,9 @@ def published_config(name: str, model: str) -> Any:
                 enable_temporal_pos_encoding_for_object_pointers=False,
                 enable_occlusion_spatial_embedding=False,
             )
+        case "Sam3Model" | "SiglipVisionModel" | "Sam3TrackerVideoModel":
+            return getattr(hf, name.replace("Model", "Config"))()
     raise KeyError(name)
-
-
-def _swin(model: str) -> Any:
-    """The backbone of the detectors whose names end in their size."""
-    import transformers
-
-    hf: Any = transformers
-    size = SWIN_BASE if model.endswith("-base") else SWIN_TINY
-    return hf.SwinConfig(**size, out_indices=[2, 3, 4])
 
 
 def letter_tokenizer() -> Any:
@@ -263,13 +224,17 @@ def letter_tokenizer() -> Any:
     from transformers import BertTokenizer
 
     tokens = [f"[unused{i}]" for i in range(1030)]
-    tokens[0] = "[PAD]"
-    tokens[100] = "[UNK]"
-    tokens[101] = "[CLS]"
-    tokens[102] = "[SEP]"
-    tokens[103] = "[MASK]"
-    tokens[1012] = "."
-    tokens[1029] = "?"
+    special = {
+        0: "[PAD]",
+        100: "[UNK]",
+        101: "[CLS]",
+        102: "[SEP]",
+        103: "[MASK]",
+        1012: ".",
+        1029: "?",
+    }
+    for i, token in special.items():
+        tokens[i] = token
     for i, letter in enumerate("abcdefghijklmnopqrstuvwxyz"):
         tokens[200 + 2 * i] = letter
         tokens[201 + 2 * i] = f"##{letter}"

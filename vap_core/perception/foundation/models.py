@@ -127,13 +127,8 @@ class PhraseDetector(ABC):
             for batch in self.runtime.batches(same_size, BATCH):
                 xyxy, score = self._propose([images[i] for i in batch], phrase)
                 for row, i in enumerate(batch):
-                    proposals[i] = select_boxes(
-                        xyxy=xyxy[row],
-                        score=score[row],
-                        hw=images[i].shape[:2],
-                        phrase=phrase,
-                        threshold=threshold,
-                    )
+                    hw = images[i].shape[:2]
+                    proposals[i] = select_boxes(xyxy[row], score[row], hw, phrase, threshold)
         return proposals
 
     @abstractmethod
@@ -146,15 +141,19 @@ class PhraseDetector(ABC):
 class GroundingDino(PhraseDetector):
     """The foundation detector.
 
-    `tokenizer` and `processor` are those that the weights were trained with.
+    `tokenizer` is the one that the weights were trained with.
     """
 
     threshold = THRESHOLD
 
-    def __init__(self, model: Any, tokenizer: Any, processor: Any, runtime: Runtime) -> None:
+    def __init__(self, model: Any, tokenizer: Any, runtime: Runtime) -> None:
+        from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
+            GroundingDinoImageProcessorPil,
+        )
+
         super().__init__(model, runtime)
         self.tokenizer = tokenizer
-        self.processor = processor
+        self.processor = GroundingDinoImageProcessorPil()
 
     def _propose(
         self, images: Sequence[Rgb], phrase: str
@@ -169,14 +168,11 @@ class GroundingDino(PhraseDetector):
             max_length=self.model.config.max_text_len,
             return_tensors="pt",
         )
-        inputs: dict[str, torch.Tensor] = {}
-        for key, tensor in {**pixels, **words}.items():
-            inputs[key] = tensor.to(self.runtime.device)
+        inputs = {k: tensor.to(self.runtime.device) for k, tensor in {**pixels, **words}.items()}
         with self.runtime.inference():
             out = self.model(**inputs)
         h, w = padded[0].shape[:2]
-        centre = out.pred_boxes.float()[..., :2]
-        size = out.pred_boxes.float()[..., 2:]
+        centre, size = out.pred_boxes.float().split(2, -1)
         corners = torch.cat([centre - size / 2, centre + size / 2], -1)
         xyxy = corners * torch.tensor([w, h, w, h], device=size.device)
         score = out.logits.float().sigmoid().amax(-1)
@@ -230,21 +226,23 @@ class CropRecipe:
     mean: tuple[float, float, float] = IMAGENET.mean
     std: tuple[float, float, float] = IMAGENET.std
     resample: int = 3
+    pooled: bool = False
+    """The network pools its tokens by attention; else its [CLS] token is the embedding."""
 
     @property
     def grey(self) -> tuple[int, int, int]:
         """The colour that normalises to zero."""
-        red, green, blue = (round(255 * level) for level in self.mean)
-        return red, green, blue
+        r, g, b = self.mean
+        return round(255 * r), round(255 * g), round(255 * b)
 
 
 DINO = CropRecipe()
 DINOV3 = CropRecipe(resample=2)
-SIGLIP = CropRecipe(mean=CENTRED.mean, std=CENTRED.std, resample=3)
+SIGLIP = CropRecipe(mean=CENTRED.mean, std=CENTRED.std, pooled=True)
 
 
 class CropEncoder:
-    """A network whose [CLS] token is the embedding.
+    """A network whose [CLS] token, or pool of all tokens, is the embedding.
 
     A crop is padded to a square, so that nothing of a long object is cut off: no centre crop.
     """
@@ -268,29 +266,16 @@ class CropEncoder:
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
         rows = [np.zeros((0, self.dim), np.float32)]
         for batch in self.runtime.batches(crops, ENCODER_BATCH):
-            rows.append(self._embed(batch))
+            pixels = self.processor(
+                images=[pad_to_square(crop, self.recipe.grey) for crop in batch],
+                input_data_format="channels_last",
+                return_tensors="pt",
+            )["pixel_values"]
+            with self.runtime.inference():
+                out = self.model(pixels.to(self.runtime.device))
+                row = out.pooler_output if self.recipe.pooled else out.last_hidden_state[:, 0]
+                rows.append(F.normalize(row.float(), dim=1).cpu().numpy())
         return np.concatenate(rows)
-
-    def _embed(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
-        pixels = self.processor(
-            images=[pad_to_square(crop, self.recipe.grey) for crop in crops],
-            input_data_format="channels_last",
-            return_tensors="pt",
-        )["pixel_values"]
-        with self.runtime.inference():
-            row = self._row(self.model(pixels.to(self.runtime.device))).float()
-            return F.normalize(row, dim=1).cpu().numpy()
-
-    def _row(self, out: Any) -> Tensor:
-        """The embedding in the network's output."""
-        return out.last_hidden_state[:, 0]
-
-
-class PooledEncoder(CropEncoder):
-    """A network that pools its tokens by attention."""
-
-    def _row(self, out: Any) -> Tensor:
-        return out.pooler_output
 
 
 def pad_to_square(crop: Rgb, grey: tuple[int, int, int] = DINO.grey) -> Rgb:
@@ -455,13 +440,7 @@ class SamSegmenter:
         with torch.inference_mode():  # coordinates stay in single precision
             sparse, dense = sam.model.prompt_encoder(None, None, corners, None)
             coarse = features.coarse + sam.model.no_memory_embedding[..., None].transpose(1, 2)
-            return sam.decode(
-                features=features,
-                coarse=coarse,
-                sparse=sparse,
-                dense=dense,
-                alternatives=False,
-            )
+            return sam.decode(features, coarse, sparse, dense, alternatives=False)
 
 
 def to_pixels(logits: Float[Tensor, "n k h w"], hw: tuple[int, int]) -> Float[Tensor, "n k y x"]:
@@ -531,7 +510,4 @@ class Sam3Detector(PhraseDetector):
             max_length=MAX_TOKENS,
             return_tensors="pt",
         )
-        words: dict[str, Tensor] = {}
-        for name in ("input_ids", "attention_mask"):
-            words[name] = tokens[name].to(self.runtime.device)
-        return words
+        return {k: tokens[k].to(self.runtime.device) for k in ("input_ids", "attention_mask")}

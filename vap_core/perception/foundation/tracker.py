@@ -67,10 +67,7 @@ class SamTracker:
     def start(
         self, images: Sequence[Rgb], masks: Sequence[Bool[np.ndarray, "_n _h _w"]]
     ) -> list[SamTrackState]:
-        states: list[SamTrackState] = []
-        for image, of_view in zip(images, masks, strict=True):
-            states.append(self._start(image, of_view))
-        return states
+        return [self._start(*view) for view in zip(images, masks, strict=True)]
 
     def step(
         self, states: Sequence[SamTrackState], images: Sequence[Rgb]
@@ -97,13 +94,17 @@ class SamTracker:
                 "they must agree"
             )
         if not len(masks):
-            return SamTrackState(hw=hw, frame_index=0, first=None, recent=(), pointers=())
+            return SamTrackState(hw, 0, None, (), ())
         features = self.sam.encode_first_frame(image)
         coarse = features.coarse.expand(len(masks), -1, -1, -1)
         with torch.inference_mode():
-            planes = self._to_model_masks(masks)
+            # Zeros and ones at the model's resolution, and at that of the prompt encoder.
+            planes = torch.from_numpy(masks.copy()).to(self.sam.runtime.device)[:, None].float()
+            planes = (_resized(planes, (self.sam.side, self.sam.side)) >= 0.5).float()
             visible = planes.flatten(1).any(dim=1)
-            decoded = self._decode(features, coarse, self._mask_prompt(planes))
+            prompt = self.sam.model.mask_downsample(planes)
+            prompt = _resized(prompt, self.sam.model.prompt_encoder.mask_input_size)
+            decoded = self._decode(features, coarse, prompt)
             first = self._memory_entry(
                 features=features,
                 logits=CERTAIN_LOGIT * (2 * planes - 1),
@@ -111,7 +112,7 @@ class SamTracker:
                 visible=visible,
                 certain=True,
             )
-        return SamTrackState(hw=hw, frame_index=0, first=first, recent=(), pointers=())
+        return SamTrackState(hw, 0, first, (), ())
 
     def _step(
         self, state: SamTrackState, features: ImageFeatures
@@ -131,9 +132,10 @@ class SamTracker:
             )
             masks = (to_pixels(best, state.hw)[:, 0] > 0).cpu().numpy()
             scores = decoded.presence.sigmoid().cpu().numpy()
-        tracks: list[Track] = []
-        for mask, score in zip(masks, scores, strict=True):
-            tracks.append(Track(mask if mask.any() else None, float(score)))
+        tracks = tuple(
+            Track(mask if mask.any() else None, float(score))
+            for mask, score in zip(masks, scores, strict=True)
+        )
         new_state = SamTrackState(
             hw=state.hw,
             frame_index=state.frame_index + 1,
@@ -141,23 +143,7 @@ class SamTracker:
             recent=(*state.recent, entry)[-self.recent :],
             pointers=(*state.pointers, entry.pointer)[-(self.max_pointers - 1) :],
         )
-        return new_state, tuple(tracks)
-
-    def _to_model_masks(self, masks: Bool[np.ndarray, "n h w"]) -> Float[Tensor, "n 1 s s"]:
-        """Masks as zeros and ones at the model's resolution."""
-        size = (self.sam.side, self.sam.side)
-        planes = torch.from_numpy(masks.copy()).to(self.sam.runtime.device)[:, None].float()
-        if masks.shape[1:] == size:
-            return planes
-        return (F.interpolate(planes, size, mode="bilinear", antialias=True) >= 0.5).float()
-
-    def _mask_prompt(self, planes: Float[Tensor, "n 1 s s"]) -> Float[Tensor, "n 1 y x"]:
-        """Masks at the resolution of the prompt encoder."""
-        prompt = self.sam.model.mask_downsample(planes)
-        size = self.sam.model.prompt_encoder.mask_input_size
-        if prompt.shape[-2:] == torch.Size(size):
-            return prompt
-        return F.interpolate(prompt, size, mode="bilinear", antialias=True)
+        return new_state, tracks
 
     def _decode(
         self,
@@ -174,13 +160,7 @@ class SamTracker:
         no_points = torch.zeros(n, 1, 1, 2, device=device)
         unused = -torch.ones(n, 1, 1, dtype=torch.int32, device=device)
         sparse, dense = self.sam.model.prompt_encoder(no_points, unused, None, mask_prompt)
-        return self.sam.decode(
-            features=features,
-            coarse=coarse,
-            sparse=sparse,
-            dense=dense,
-            alternatives=True,
-        )
+        return self.sam.decode(features, coarse, sparse, dense, alternatives=True)
 
     def _pointer(self, decoded: DecodedMasks, visible: Bool[Tensor, " n"]) -> Float[Tensor, "n c"]:
         """The projected token of the best mask, or the learned pointer of an absent identity."""
@@ -204,7 +184,8 @@ class SamTracker:
         """
         model = self.sam.model
         config = model.config
-        logits = self._to_memory_size(logits)
+        h, w = self.map_positions.shape[-2:]
+        logits = _resized(logits, (16 * h, 16 * w))  # as the memory encoder takes it
         planes = (logits > 0).float() if certain else logits.sigmoid()
         planes = planes * config.sigmoid_scale_for_mem_enc + config.sigmoid_bias_for_mem_enc
         coarse = features.coarse.expand(len(logits), -1, -1, -1)
@@ -215,14 +196,6 @@ class SamTracker:
             occluded = cells + model.occlusion_spatial_embedding_parameter[..., None, None]
             cells = torch.where(visible[:, None, None, None], cells, occluded)
         return MemoryEntry(self._stored(cells), pointer)
-
-    def _to_memory_size(self, logits: Float[Tensor, "n 1 s s"]) -> Float[Tensor, "n 1 y x"]:
-        """Mask logits at the resolution of the memory encoder, 16 times that of a coarse map."""
-        h, w = self.map_positions.shape[-2:]
-        size = (16 * h, 16 * w)
-        if logits.shape[-2:] == torch.Size(size):
-            return logits
-        return F.interpolate(logits, size, mode="bilinear", antialias=True)
 
     def _stored(self, maps: Float[Tensor, "n m h w"]) -> Float[Tensor, "p n m"]:
         """What is kept of each identity's map of a frame, in half precision."""
@@ -291,6 +264,13 @@ class SamTracker:
         )
         positions = times.repeat_interleave(pieces, 0)[:, None].expand(-1, n, -1)
         return keys, positions
+
+
+def _resized(maps: Float[Tensor, "n 1 h w"], size: Sequence[int]) -> Float[Tensor, "n 1 y x"]:
+    """Planes at another resolution; those that have it already stay as they are."""
+    if maps.shape[-2:] == torch.Size(size):
+        return maps
+    return F.interpolate(maps, tuple(size), mode="bilinear", antialias=True)
 
 
 def _best_alternative(
