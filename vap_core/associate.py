@@ -356,10 +356,11 @@ def _check_poses(
     """Raises: BadViews: of two views or more that have candidates, one has no camera, or one of a
     pose that cannot be; or all look away from the table. (A hand may look up for a while.)
     """
-    views = []
-    for view, per_target in groundings.items():
-        if any(len(grounding.candidates) for grounding in per_target):
-            views.append(view)
+    views = [
+        view
+        for view, per_target in groundings.items()
+        if any(len(grounding.candidates) for grounding in per_target)
+    ]
     if len(views) < 2:
         return
     missing = [view for view in views if view not in cameras]

@@ -341,9 +341,7 @@ class Attender:
             masks[camera] = masks_by_id(candidates[camera])
             tracks[camera] = _first_tracks(groundings[camera], ids[camera])
 
-        scenes = []
-        for camera, rgb in views.items():
-            scenes.append((rgb, list(masks[camera])))
+        scenes = [(rgb, list(masks[camera])) for camera, rgb in views.items()]
         colours = choose_colours(len(parsed.targets), scenes, self.prompting.palette)
         shown = {camera: are_shown(per_target) for camera, per_target in tracks.items()}
         text = parsed.text
@@ -445,9 +443,7 @@ class Attender:
         self, views: Views, phrases: Sequence[str], given: Mapping[str, Boxes] | None
     ) -> dict[str, dict[str, Proposals]]:
         """Proposals by camera and phrase; each phrase is detected once."""
-        proposals: dict[str, dict[str, Proposals]] = {}
-        for camera in views:
-            proposals[camera] = {}
+        proposals: dict[str, dict[str, Proposals]] = {camera: {} for camera in views}
         for phrase in dict.fromkeys(phrases):
             if given is None:
                 offered = propose(views, phrase, self.stack)
@@ -574,11 +570,11 @@ def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tupl
 
 def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> list[Mask]:
     """The masks of what is followed and is no target, where they are visible."""
-    others = []
-    for identity, mask in enumerate(followed):
-        if identity not in ids and mask is not None and mask.any():
-            others.append(mask)
-    return others
+    return [
+        mask
+        for identity, mask in enumerate(followed)
+        if identity not in ids and mask is not None and mask.any()
+    ]
 
 
 def _colours_in_view(

@@ -272,11 +272,7 @@ def object_files(bank: Path) -> list[Path]:
             f"load_bank: {bank} cannot be read ({error.strerror or error}); check its permissions, "
             "or choose another folder with --memory."
         ) from error
-    found = []
-    for path in paths:
-        if path.name.endswith(SUFFIX) and not path.name.startswith("."):
-            found.append(path)
-    return found
+    return [path for path in paths if path.name.endswith(SUFFIX) and not path.name.startswith(".")]
 
 
 def taken(path: Path) -> BadOutput:
@@ -311,10 +307,7 @@ def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
     if not CATEGORY.fullmatch(category):
         raise BadMemory(f"load: {path} has the category {category[:64]!r}; {AGAIN}.")
     try:
-        crops = []
-        for key in sorted(tensors):
-            if key.startswith("crop."):
-                crops.append(tensors[key])
+        crops = [tensors[key] for key in sorted(tensors) if key.startswith("crop.")]
         description = None
         if "description" in header:
             description = Description(**parse_json(header["description"]))

@@ -5,5 +5,6 @@
 """
 
 from vap_core.policies.lerobot import step as step
+from vap_core.policies.lerobot import twin as twin
 from vap_core.policies.mini_pi0 import configuration_mini_pi0 as configuration_mini_pi0
 from vap_core.policies.mini_pi0 import processor_mini_pi0 as processor_mini_pi0

@@ -130,9 +130,10 @@ def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) ->
 
 def describe(owners: dict[str, tuple[str, ...]]) -> str:
     """ "anna, ben (brother)", for an error."""
-    names = []
-    for name, known_as in sorted(owners.items()):
-        names.append(f"{name} ({', '.join(known_as)})" if known_as else name)
+    names = [
+        f"{name} ({', '.join(known_as)})" if known_as else name
+        for name, known_as in sorted(owners.items())
+    ]
     return ", ".join(names)
 
 

@@ -382,10 +382,11 @@ class Possession:
         if fold(owner) not in OTHERS:
             return owner
         people = re.compile(rf"\b(?:{person_pattern(self.context)})\b", re.IGNORECASE)
-        named = []
-        for match in people.finditer(self.text[: expression.start]):
-            if fold(match.group()) not in MINE:
-                named.append(match.group())
+        named = [
+            match.group()
+            for match in people.finditer(self.text[: expression.start])
+            if fold(match.group()) not in MINE
+        ]
         return named[-1] if named else owner
 
 

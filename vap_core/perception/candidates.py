@@ -96,10 +96,10 @@ def embed_views(views: Views, boxes: Mapping[str, Boxes], stack: Stack) -> dict[
     by one encoder.
     """
     familiar = any(of_view.familiar for of_view in boxes.values())
-    proposals = {}
-    for camera, rgb in views.items():
-        proposals[camera] = embed(rgb, replace(boxes[camera], familiar=familiar), stack)
-    return proposals
+    return {
+        camera: embed(rgb, replace(boxes[camera], familiar=familiar), stack)
+        for camera, rgb in views.items()
+    }
 
 
 def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:

@@ -276,9 +276,7 @@ class AttributeCaptioner:
     segmenter: Segmenter
 
     def __call__(self, crops: Sequence[Rgb], category: str) -> Description:
-        measured: list[CropAttributes] = []
-        for rgb in crops:
-            measured.append(measure_crop(rgb, self.segmenter))
+        measured = [measure_crop(rgb, self.segmenter) for rgb in crops]
         return phrase_attributes(measured, category)
 
 
@@ -354,9 +352,7 @@ def phrase_attributes(measured: Sequence[CropAttributes], category: str) -> Desc
 
 def _mean_shares(measured: Sequence[CropAttributes]) -> dict[str, float]:
     """Every colour's share of the object, over all crops."""
-    share: dict[str, float] = {}
-    for name in COLOURS:
-        share[name] = float(np.mean([crop.share[name] for crop in measured]))
+    share = {name: float(np.mean([crop.share[name] for crop in measured])) for name in COLOURS}
     if share["grey"] < GREY_SHARE:
         share["grey"] = 0.0
     return share

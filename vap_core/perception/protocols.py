@@ -132,10 +132,10 @@ class JudgedDetector:
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
     ) -> list[Boxes]:
         """The detector's boxes; a view without any is judged, too."""
-        judged = []
-        for image, boxes in zip(images, self.detector(images, phrase, threshold), strict=True):
-            judged.append(replace(boxes, familiar=self.is_familiar(image, phrase)))
-        return judged
+        return [
+            replace(boxes, familiar=self.is_familiar(image, phrase))
+            for image, boxes in zip(images, self.detector(images, phrase, threshold), strict=True)
+        ]
 
     def is_familiar(self, image: Rgb, phrase: str) -> bool:
         return self.judge.is_familiar(image, phrase)

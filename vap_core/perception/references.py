@@ -100,9 +100,7 @@ def choose_references(
 
 def whole_photos(photos: Sequence[Rgb]) -> tuple[Reference, ...]:
     """References that are cut out already."""
-    references = []
-    for photo in photos:
-        references.append(_whole(photo, ""))
+    references = [_whole(photo, "") for photo in photos]
     return tuple(references)
 
 

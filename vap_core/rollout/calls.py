@@ -76,10 +76,7 @@ def check_limit(limit_s: float | None) -> None:
 def check_policy(policy: Any) -> None:
     """Raises: BadPolicy when a policy lacks what a rollout needs (policies.protocol)."""
     name = type(policy).__name__
-    lacking = []
-    for part in ("label", "execute", "start"):
-        if not hasattr(policy, part):
-            lacking.append(part)
+    lacking = [part for part in ("label", "execute", "start") if not hasattr(policy, part)]
     if not hasattr(policy, "plan") and not hasattr(policy, "plan_from_simulation"):
         lacking.append("plan")
     if lacking:
@@ -234,10 +231,7 @@ def plan(
             f"audit: {policy.label} does not report what it consumes; call "
             "vap_core.policies.protocol.report_input where it uses its inputs."
         )
-    digests: list[Digests] = []
-    for i in range(len(prompted)):
-        digests.append((of_prompted[i], of_raw[i]))
-    return after, chunks, digests
+    return after, chunks, [(of_prompted[i], of_raw[i]) for i in range(len(prompted))]
 
 
 def compare(

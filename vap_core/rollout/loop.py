@@ -135,9 +135,7 @@ def rollout(
         raise BadStudy(f"rollout: batch is {batch}; give how many episodes run at once, from 1 on.")
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
-        running = []
-        for row in rows[first : first + batch]:
-            running.append(_begin(trial, row, keeps_images))
+        running = [_begin(trial, row, keeps_images) for row in rows[first : first + batch]]
         live = _live(running)
         while live:
             for episode in live:
@@ -356,9 +354,7 @@ def _open_subgoal(episode: RunningEpisode, attended: Attended) -> None:
 def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> EpisodeHeader:
     row = episode.row
     env = episode.env
-    sizes_m = {}
-    for place in row.placements:
-        sizes_m[place.model] = trial.scene.sizes_m[place.model]
+    sizes_m = {place.model: trial.scene.sizes_m[place.model] for place in row.placements}
     return EpisodeHeader(
         row=row,
         method=trial.method,

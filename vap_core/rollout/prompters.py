@@ -172,10 +172,10 @@ class TextPrompter:
         observations: Sequence[Observation],
         contexts: Sequence[PromptContext],
     ) -> list[tuple[str, Attended]]:
-        results = []
-        for text, observation in zip(states, observations, strict=True):
-            results.append((text, unchanged(observation.images, text)))
-        return results
+        return [
+            (text, unchanged(observation.images, text))
+            for text, observation in zip(states, observations, strict=True)
+        ]
 
 
 def generic() -> TextPrompter:
@@ -368,11 +368,7 @@ class OraclePrompter:
 
     def _visible(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
         """The visible objects of the category, by name."""
-        visible = {}
-        for name, mask in masks.items():
-            if name in self.alike and mask.any():
-                visible[name] = mask
-        return visible
+        return {name: mask for name, mask in masks.items() if name in self.alike and mask.any()}
 
     def _describe(self, rgb: Rgb, phrase: str, masks: Sequence[Mask]) -> Candidates:
         """The candidates of one view: true boxes, and true masks.

@@ -203,9 +203,7 @@ def expert_steps(
 
     Raises: OutOfReach.
     """
-    sizes = {}
-    for place in row.placements:
-        sizes[place.model] = env.scene.sizes_m[place.model]
+    sizes = {place.model: env.scene.sizes_m[place.model] for place in row.placements}
     judge = Judge.start(row, sizes, env.truth())
     while not judge.done and judge.steps < row.max_steps:
         (state,), (chunk,) = expert.plan_from_simulation([state], [env])

@@ -256,9 +256,10 @@ class Diagnosis:
 
     def columns(self) -> dict[str, Any]:
         """Its part of a row of a results table."""
-        evidence = {}
-        for name, part in self.evidence.items():
-            evidence[name] = round(part, 4) if isinstance(part, float) else part
+        evidence = {
+            name: round(part, 4) if isinstance(part, float) else part
+            for name, part in self.evidence.items()
+        }
         return {
             "case": self.case,
             "sub_case": self.sub_case,

@@ -51,9 +51,7 @@ class Backbone(nn.Module):
         stages.append(nn.Sequential(_convolution(HEAD), nn.ReLU6()))
         self.names.append("head")
         self.stages = nn.ModuleList(stages)
-        weights = {}
-        for name, array in folded_weights().items():
-            weights[name] = torch.from_numpy(array)
+        weights = {name: torch.from_numpy(array) for name, array in folded_weights().items()}
         self.load_state_dict(weights)
         self.requires_grad_(False).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

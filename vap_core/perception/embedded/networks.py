@@ -51,10 +51,11 @@ def load_weights(
     from safetensors.numpy import load
 
     data, entry = read_checked(name, folder)
-    arrays: Weights = {}
-    for key, array in load(data).items():
-        if key.startswith(prefix):
-            arrays[key.removeprefix(prefix)] = array.astype(np.float32)
+    arrays = {
+        key.removeprefix(prefix): array.astype(np.float32)
+        for key, array in load(data).items()
+        if key.startswith(prefix)
+    }
     return arrays, entry
 
 
@@ -93,9 +94,7 @@ def save_weights(
     """Write half-precision weights and their manifest entry; the other entries stay as they are."""
     from safetensors.torch import save
 
-    halves: dict[str, Tensor] = {}
-    for key, tensor in tensors.items():
-        halves[key] = tensor.detach().cpu().half().contiguous()
+    halves = {key: tensor.detach().cpu().half().contiguous() for key, tensor in tensors.items()}
     return write_entry(name, save(halves), about, folder)
 
 
@@ -124,14 +123,9 @@ def weights_sha256() -> dict[str, str]:
 
     Those of the backbone and of the text encoder, which do not ship, count too.
     """
-    files: list[Path] = []
-    for name in sorted(read_manifest()):
-        if (FOLDER / name).is_file():
-            files.append(FOLDER / name)
+    files = [FOLDER / name for name in sorted(read_manifest()) if (FOLDER / name).is_file()]
     files.append(lite0_file())
-    digests: dict[str, str] = {}
-    for path in files:
-        digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     digests[TENSORS] = text_encoder.weights_sha256()
     return digests
 
@@ -340,11 +334,11 @@ STAGES = tuple([*(f"b{i}" for i in range(len(BLOCKS))), "head"])
 def trunk_weights(taps: Sequence[str]) -> Weights:
     """The weights of a `backbone.Trunk` up to the deepest of some taps, by name."""
     depth = 1 + max(map(STAGES.index, taps))
-    chosen: Weights = {}
-    for name, array in folded_weights().items():
-        if int(name.split(".")[1]) < depth:
-            chosen[f"trunk.{name}"] = array
-    return chosen
+    return {
+        f"trunk.{name}": array
+        for name, array in folded_weights().items()
+        if int(name.split(".")[1]) < depth
+    }
 
 
 @cache

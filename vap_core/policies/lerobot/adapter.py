@@ -101,14 +101,21 @@ class LeRobot:
         self.preprocessor = preprocessor
         self.postprocessor = postprocessor
         self.label = label
-        self.noisy = _takes_noise(policy)
+        # Whether the sampling noise is an argument of the policy's model.
+        sampler = getattr(getattr(policy, "model", None), "sample_actions", None)
+        self.noisy = sampler is not None and "noise" in inspect.signature(sampler).parameters
         remembers = config.n_obs_steps != 1
         ensembles = getattr(config, "temporal_ensemble_coeff", None) is not None
         draws_nothing = config.type in DRAWS_NOTHING
         self.batched = not remembers and not ensembles and (self.noisy or draws_nothing)
         self.execute = int(config.n_action_steps) if self.batched else 1
         self.action_size = int(config.action_feature.shape[0])
-        self.renamed = _renamed_features(preprocessor)
+        # The key that the preprocessor expects, by the key to which it renames it.
+        renamed = {}
+        for step in preprocessor.steps:
+            for old, new in getattr(step, "rename_map", {}).items():
+                renamed[new] = old
+        self.renamed = renamed
         self.wanted: Shapes = {}
         """Shape of every feature that is read, under the key that the preprocessor expects."""
         for key, feature in config.input_features.items():
@@ -243,9 +250,10 @@ class LeRobot:
         """Reports the attention of a call where somebody observes it."""
         if not self.attends or not attention_observed():
             return nullcontext()
-        places = []
-        for episode, tokens in enumerate(batch[TOKENS]):
-            places.append(positions(self.preprocessor, tokens, phrases_of(episode)))
+        places = [
+            positions(self.preprocessor, tokens, phrases_of(episode))
+            for episode, tokens in enumerate(batch[TOKENS])
+        ]
         return reporting_attention(self.policy, self.cameras(), places)
 
     def _plan_step(self, episode: int, state: LeRobotState, policy_input: PolicyInput) -> Chunk:
@@ -284,9 +292,9 @@ class LeRobot:
         for key, tensor in batch.items():
             if key == TOKENS:
                 name = TEXT
-                rows = []
-                for tokens, mask in zip(tensor, batch[TOKEN_MASK], strict=True):
-                    rows.append(tokens[mask])
+                rows = [
+                    tokens[mask] for tokens, mask in zip(tensor, batch[TOKEN_MASK], strict=True)
+                ]
             elif key.startswith(IMAGE):
                 name = self._camera(key)
                 rows = list(tensor)
@@ -352,15 +360,7 @@ def load_for_suite(
 
     Raises: BadPolicy, as `load_policy`, and when it does not fit them.
     """
-    policy = _load_once(checkpoint, temperature)
-    env = Env(scene, control=suite.control)
-    state_size = len(env.state())
-    policy.check(suite.cameras, state_size, env.action_size)
-    return policy
-
-
-def _load_once(checkpoint: str, temperature: float | None) -> LeRobot:
-    """The checkpoint as its files are now. Raises: BadPolicy, as `load_policy`."""
+    # The checkpoint as its files are now. Raises: BadPolicy, as `load_policy`.
     key = (checkpoint, temperature)
     now = stamp(checkpoint)
     if key in _loaded and _loaded[key][0] != now:
@@ -368,22 +368,11 @@ def _load_once(checkpoint: str, temperature: float | None) -> LeRobot:
         del _loaded[key]
     if key not in _loaded:
         _loaded[key] = (now, load_policy(checkpoint, temperature=temperature))
-    return _loaded[key][1]
-
-
-def _takes_noise(policy: "PreTrainedPolicy") -> bool:
-    """Whether the sampling noise is an argument of the policy's model."""
-    sampler = getattr(getattr(policy, "model", None), "sample_actions", None)
-    return sampler is not None and "noise" in inspect.signature(sampler).parameters
-
-
-def _renamed_features(preprocessor: Any) -> dict[str, str]:
-    """The key that the preprocessor expects, by the key to which it renames it."""
-    renamed = {}
-    for step in preprocessor.steps:
-        for old, new in getattr(step, "rename_map", {}).items():
-            renamed[new] = old
-    return renamed
+    policy = _loaded[key][1]
+    env = Env(scene, control=suite.control)
+    state_size = len(env.state())
+    policy.check(suite.cameras, state_size, env.action_size)
+    return policy
 
 
 def _copy_policy(policy: "PreTrainedPolicy") -> "PreTrainedPolicy":
@@ -406,7 +395,7 @@ def _resize(images: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
 
 def _format_shapes(features: Shapes) -> str:
     """The features' keys, and the sizes of those that are vectors."""
-    parts = []
-    for key, shape in sorted(features.items()):
-        parts.append(f"{key} ({shape[0]})" if len(shape) == 1 else key)
+    parts = [
+        f"{key} ({shape[0]})" if len(shape) == 1 else key for key, shape in sorted(features.items())
+    ]
     return ", ".join(parts) or "nothing"

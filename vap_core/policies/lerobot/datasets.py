@@ -163,7 +163,14 @@ class Copy:
         described = dict(self._features)
         self._masks = {}
         for camera, key in source.keys.items() if masks else ():
-            height_width = _height_width(self._features[key]["shape"])
+            # Of a picture's shape, whose channels come first or last.
+            shape = self._features[key]["shape"]
+            height, width = [
+                side
+                for i, side in enumerate(shape)
+                if i != (0 if shape[0] == 3 and shape[-1] != 3 else len(shape) - 1)
+            ]
+            height_width = height, width
             feature = {"dtype": "uint8", "shape": height_width, "names": ["height", "width"]}
             self._masks[camera] = height_width
             described[MASK + camera] = feature
@@ -262,16 +269,6 @@ def _camera(key: str) -> str:
         if key.startswith(prefix):
             return key.removeprefix(prefix)
     return key
-
-
-def _height_width(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Of a picture's shape, whose channels come first or last."""
-    height, width = [side for i, side in enumerate(shape) if i != _channel_axis(shape)]
-    return height, width
-
-
-def _channel_axis(shape: tuple[int, ...]) -> int:
-    return 0 if shape[0] == 3 and shape[-1] != 3 else len(shape) - 1
 
 
 def _rgb(picture: Any) -> Rgb:

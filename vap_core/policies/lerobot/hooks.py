@@ -162,9 +162,7 @@ class Watch:
     def __init__(self, layout: Layout, positions: Sequence[Positions]) -> None:
         self.layout = layout
         self.positions = positions
-        patches = []
-        for start in layout.starts:
-            patches.append(start + torch.arange(layout.side**2))
+        patches = [start + torch.arange(layout.side**2) for start in layout.starts]
         self._patches = torch.cat(patches)
         self._words: dict[tuple[int, str], dict[int, torch.Tensor]] = {}
         self._actions: dict[int, list[torch.Tensor]] = {}
@@ -184,9 +182,7 @@ class Watch:
 
     def report(self) -> None:
         """Report the maps of every episode and camera."""
-        of_actions = []
-        for layer in sorted(self._actions):
-            of_actions.append(torch.stack(self._actions[layer]).mean(0))
+        of_actions = [torch.stack(self._actions[layer]).mean(0) for layer in sorted(self._actions)]
         for episode, positions in enumerate(self.positions):
             queries = {}
             for query in positions:

@@ -35,18 +35,6 @@ Scaled = tuple[Any, str, Any]
 """A step that scales, the key of what it scales, and the feature of that key."""
 
 
-def require_statistics(folder: Path, config: Any, preprocessor: Any, postprocessor: Any) -> None:
-    """Check that every input and the actions of a checkpoint's policy are scaled as it says.
-
-    Raises: BadPolicy when statistics are absent, or of another length than what they scale.
-    """
-    scaled = (*_inputs(config, preprocessor), *_actions(config, postprocessor))
-    for step, key, feature in scaled:
-        fault = _fault(step, key, feature)
-        if fault:
-            raise BadPolicy(f"load: {folder} has {fault}; save it with the dataset's statistics.")
-
-
 def _inputs(config: Any, preprocessor: Any) -> Iterator[Scaled]:
     """What the normalisers of a preprocessor scale. An action is no input, and goes through none.
 
@@ -54,10 +42,9 @@ def _inputs(config: Any, preprocessor: Any) -> Iterator[Scaled]:
     """
     from lerobot.processor import NormalizerProcessorStep
 
-    features = {}
-    for key, feature in config.input_features.items():
-        if not key.startswith(EMPTY):
-            features[key] = feature
+    features = {
+        key: feature for key, feature in config.input_features.items() if not key.startswith(EMPTY)
+    }
     for step in reversed(preprocessor.steps):
         if isinstance(step, NormalizerProcessorStep):
             chosen = step.normalize_observation_keys
@@ -124,7 +111,11 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
             f"load: {folder} cannot become a policy "
             f"({type(error).__name__}: {first_line(error):.200}); {remedy}."
         ) from error
-    require_statistics(folder, policy.config, preprocessor, postprocessor)
+    scaled = (*_inputs(policy.config, preprocessor), *_actions(policy.config, postprocessor))
+    for step, key, feature in scaled:
+        fault = _fault(step, key, feature)
+        if fault:
+            raise BadPolicy(f"load: {folder} has {fault}; save it with the dataset's statistics.")
     with _silence():
         compare(policy, folder / WEIGHTS)
     return policy, preprocessor, postprocessor
@@ -204,9 +195,7 @@ def _names_in_file(
 
     openpi's names are mapped by the policy itself; numbers stand in for the tensors meanwhile.
     """
-    numbered = {}
-    for i, name in enumerate(names):
-        numbered[name] = torch.tensor(i)
+    numbered = {name: torch.tensor(i) for i, name in enumerate(names)}
     rename: Callable[..., dict[str, Any]] | None
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if rename is not None:

@@ -143,11 +143,7 @@ class VapPrompt(ProcessorStep):
         return prompted
 
     def get_config(self) -> dict[str, Any]:
-        config = {}
-        for option in fields(self):
-            if option.init:
-                config[option.name] = getattr(self, option.name)
-        return config
+        return {option.name: getattr(self, option.name) for option in fields(self) if option.init}
 
     def reset(self) -> None:
         """The next pictures begin an episode."""
@@ -426,9 +422,9 @@ class VapEnvConfig(EnvConfig):
 
         An environment whose episode is over stands still, as in lerobot's own.
         """
-        envs = {}
-        for i, task in enumerate(self.tasks):
-            envs[i] = self._vector_env(task, n_envs, use_async_envs)
+        envs = {
+            i: self._vector_env(task, n_envs, use_async_envs) for i, task in enumerate(self.tasks)
+        }
         return {self.suite.name: envs}
 
     def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> Any:
@@ -446,7 +442,9 @@ def _views(observation: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     """The images of an observation, by their key; those of depth are left out. Raises: BadViews."""
     views = {}
     for key, picture in observation.items():
-        if key.startswith(IMAGES) and not _is_depth(key, picture):
+        if key.startswith(IMAGES) and not (
+            "depth" in key and tuple(np.shape(picture))[-3:-2] == (1,)
+        ):
             _check_picture(key, picture)
             views[key] = picture
     return views
@@ -485,10 +483,6 @@ def _is_picture(key: str, entry: Any, is_batched: bool) -> bool:
     if len(shape) != 4 and (is_batched or len(shape) != 3):
         return False
     return shape[-3] == 3 or ("image" in key and shape[-1] == 3)
-
-
-def _is_depth(key: str, picture: Any) -> bool:
-    return "depth" in key and tuple(np.shape(picture))[-3:-2] == (1,)
 
 
 def _check_picture(key: str, picture: Any) -> None:

@@ -46,7 +46,17 @@ def toy_sizes(toy: Toy | None = None) -> Iterator[None]:
     make_expert = modeling_pi0.PiGemmaForCausalLM
 
     def make_toy_vlm(config: Any) -> Any:
-        _shrink_vlm(config, size)
+        # Set the sizes of a PaliGemma's configuration.
+        config.text_config.vocab_size = VOCABULARY
+        config.image_token_index = VOCABULARY
+        config._vocab_size = VOCABULARY
+        vision = config.vision_config
+        vision.hidden_size = size.width
+        vision.intermediate_size = 2 * size.width
+        vision.projection_dim = size.width
+        vision.num_hidden_layers = size.layers
+        vision.num_attention_heads = 4
+        vision.patch_size = size.patch
         return make_vlm(config=config)
 
     def make_toy_expert(config: Any) -> Any:
@@ -129,20 +139,6 @@ def tokenizer(folder: Path, *more: str, **special: Any) -> Any:
     )
     fast.save_pretrained(folder)
     return fast
-
-
-def _shrink_vlm(config: Any, size: Toy) -> None:
-    """Set the sizes of a PaliGemma's configuration."""
-    config.text_config.vocab_size = VOCABULARY
-    config.image_token_index = VOCABULARY
-    config._vocab_size = VOCABULARY
-    vision = config.vision_config
-    vision.hidden_size = size.width
-    vision.intermediate_size = 2 * size.width
-    vision.projection_dim = size.width
-    vision.num_hidden_layers = size.layers
-    vision.num_attention_heads = 4
-    vision.patch_size = size.patch
 
 
 def _policy_config(

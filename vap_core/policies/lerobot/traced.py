@@ -59,14 +59,16 @@ class ChunkPredictor:
 
     def __call__(self, batch: Mapping[str, Any], noise: torch.Tensor | None) -> torch.Tensor:
         """The next chunks, episodes x steps x actions, still normalised."""
-        inputs = _tensors(batch, noise)
+        inputs = {name: part for name, part in batch.items() if isinstance(part, torch.Tensor)}
+        if noise is not None:
+            inputs[NOISE] = noise
         if any(module.training for module in self._modules):
             self.policy.eval()
         if self.stays_eager or self._watched():
             return _call(self.policy, inputs)
         if self.policy.config != self._config:
             self._restart()
-        signature = _signature(inputs)
+        signature = tuple((name, part.dtype, tuple(part.shape)) for name, part in inputs.items())
         graph = self._graphs.get(signature)
         if graph is None:
             chunks = _call(self.policy, inputs)
@@ -114,7 +116,13 @@ class ChunkPredictor:
         if device != "cpu":
             self.stay_eager(f"tracing was tried on the CPU only, not on {device}")
             return
-        others = _shorter_text(inputs)
+        others = {}
+        for name, part in inputs.items():
+            if part.dtype == torch.bool and part.ndim > 1:
+                kept = torch.arange(part.shape[-1]) < (part.shape[-1] + 1) // 2
+                others[name] = part & kept
+            else:
+                others[name] = part.flip(-1)
         try:
             graph = _trace(self.policy, inputs)
             of_others = _call(self.policy, others)
@@ -159,33 +167,3 @@ def _difference(graph: Graph, inputs: Inputs, chunks: torch.Tensor) -> str:
     if torch.equal(traced, chunks):
         return ""
     return "the graph gives other actions"
-
-
-def _tensors(batch: Mapping[str, Any], noise: torch.Tensor | None) -> Inputs:
-    inputs = {}
-    for name, part in batch.items():
-        if isinstance(part, torch.Tensor):
-            inputs[name] = part
-    if noise is not None:
-        inputs[NOISE] = noise
-    return inputs
-
-
-def _signature(inputs: Inputs) -> Signature:
-    return tuple((name, part.dtype, tuple(part.shape)) for name, part in inputs.items())
-
-
-def _shorter_text(inputs: Inputs) -> Inputs:
-    """Other inputs of the same shapes: numbers in reverse, the second half of every mask unset.
-
-    A graph takes the branches that Python took when it was traced; other inputs show where those
-    depend on the numbers.
-    """
-    others = {}
-    for name, part in inputs.items():
-        if part.dtype == torch.bool and part.ndim > 1:
-            kept = torch.arange(part.shape[-1]) < (part.shape[-1] + 1) // 2
-            others[name] = part & kept
-        else:
-            others[name] = part.flip(-1)
-    return others

@@ -1,6 +1,6 @@
 """What lerobot's command line says about the twin of an SO-101, and about its expert.
 
-lerobot finds the device of `NameConfig` as `Name` in the module of this name without `config_`.
+lerobot finds the device of `NameConfig` as `Name` in this module's package.
 """
 
 import logging
@@ -91,9 +91,7 @@ class VapSo101Twin(Robot):
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        pictures = {}
-        for name, camera in self.cameras.items():
-            pictures[name] = (camera.height, camera.width, 3)
+        pictures = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
         return {**self.action_features, **pictures}
 
     @property
@@ -135,9 +133,10 @@ class VapSo101Twin(Robot):
         n = len(self._joints) - 1
         degrees = np.rad2deg(seen.state[-n:])
         positions = [*degrees.tolist(), OPEN * float(seen.state[6])]
-        observation: dict[str, Any] = {}
-        for joint, position in zip(self._joints, positions, strict=True):
-            observation[f"{joint}.pos"] = position
+        observation = {
+            f"{joint}.pos": position
+            for joint, position in zip(self._joints, positions, strict=True)
+        }
         return {**observation, **seen.images}
 
     def send_action(self, action: Mapping[str, float]) -> dict[str, float]:

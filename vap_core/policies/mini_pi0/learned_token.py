@@ -173,7 +173,11 @@ def lessons(
     patches = []
     for kind in (taught.own, taught.rivals, taught.others):
         if kind:
-            augmented = _augmentations(kind, options.augmentations, rng)
+            # `n` augmentations of every photo.
+            augmented = []
+            for photo in kind:
+                for _ in range(options.augmentations):
+                    augmented.append(augment(photo, rng))
             patches.append(question.embed(augmented))
     yield 0, question.learned()
     for step in _train(question, patches, options, rng):
@@ -279,15 +283,6 @@ def _check_kinds(name: str, photos: Photos) -> None:
         )
 
 
-def _augmentations(photos: Sequence[Rgb], n: int, rng: np.random.Generator) -> list[Rgb]:
-    """`n` augmentations of every photo."""
-    augmented = []
-    for photo in photos:
-        for _ in range(n):
-            augmented.append(augment(photo, rng))
-    return augmented
-
-
 def _train(
     question: _Question,
     patches: Sequence["torch.Tensor"],
@@ -373,11 +368,11 @@ def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
     """
     rows = list(rows)
     target = objects.get_object(rows[0].target)
-    names = []
-    for name in sorted(_placed(rows) - {target.name}):
-        if objects.get_object(name).category == target.category:
-            names.append(name)
-    return names
+    return [
+        name
+        for name in sorted(_placed(rows) - {target.name})
+        if objects.get_object(name).category == target.category
+    ]
 
 
 def file_suffix(rows: Iterable[EpisodeRow], model: str, suffix: str = SUFFIX) -> str:
@@ -523,15 +518,9 @@ def align(
     Raises: BadPolicy.
     """
     check_width(open_table(model), len(embedding), "the embedding")
-    source, target = shared_tables(model, policy)
-    return (embedding @ orthogonal_map(source, target)).astype(np.float32)
-
-
-def shared_tables(
-    model: Path, policy: Path
-) -> tuple[Float32[np.ndarray, "v d"], Float32[np.ndarray, "v d"]]:
-    """The two tables over the tokens that both have. Raises: BadPolicy."""
+    # The two tables over the tokens that both have. Raises: BadPolicy.
     tables = open_table(model), open_table(policy)
     check_width(tables[1], tables[0].shape[1], str(model))
     n = min(table.shape[0] for table in tables)
-    return tables[0].block(0, n), tables[1].block(0, n)
+    source, target = tables[0].block(0, n), tables[1].block(0, n)
+    return (embedding @ orthogonal_map(source, target)).astype(np.float32)

@@ -164,10 +164,11 @@ def load_from_policy(folder: Path) -> MiniVlm:
     try:
         config = PreTrainedConfig.from_pretrained(folder)
         vlm = MiniVlm(cast(MiniPI0Config, config))
-        weights = {}
-        for name, tensor in load_file(folder / "model.safetensors").items():
-            if name.startswith(IN_POLICY):
-                weights[name.removeprefix(IN_POLICY)] = tensor
+        weights = {
+            name.removeprefix(IN_POLICY): tensor
+            for name, tensor in load_file(folder / "model.safetensors").items()
+            if name.startswith(IN_POLICY)
+        }
         vlm.towers.paligemma.load_state_dict(weights)
     except Exception as error:
         raise BadPolicy(
@@ -184,9 +185,7 @@ def store_in_bfloat16(file: Path) -> None:
 
 
 def _write_bfloat16(tensors: Mapping[str, Tensor], file: Path) -> None:
-    halves = {}
-    for name, tensor in tensors.items():
-        halves[name] = tensor.bfloat16().contiguous()
+    halves = {name: tensor.bfloat16().contiguous() for name, tensor in tensors.items()}
     write_atomic(file, save(halves, metadata={"format": "pt"}))
 
 

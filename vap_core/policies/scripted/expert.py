@@ -97,12 +97,11 @@ class Expert:
 
         Raises: OutOfReach when the next phase cannot be planned.
         """
-        next_states = []
-        for state, env in zip(states, envs, strict=True):
-            next_states.append(self._advance(state, env))
-        chunks = []
-        for state, env in zip(next_states, envs, strict=True):
-            chunks.append(_step_towards(state.plan[0], env)[None])
+        next_states = [self._advance(state, env) for state, env in zip(states, envs, strict=True)]
+        chunks = [
+            _step_towards(state.plan[0], env)[None]
+            for state, env in zip(next_states, envs, strict=True)
+        ]
         return next_states, chunks
 
     def _advance(self, state: ExpertState, env: Env) -> ExpertState:
@@ -129,13 +128,21 @@ class Expert:
             return ExpertState("touch", plan, attempt=attempt + 1)
         if state.phase == "carry" and row.target in truth.held:
             if row.rule == "picked":
-                return ExpertState("carry", (_hold_waypoint(env),), attempt=attempt)
+                return ExpertState(
+                    "carry",
+                    (Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0, 0.5),),
+                    attempt=attempt,
+                )
             plan = _plan_set_down(env, truth)
             return ExpertState("leave", plan, attempt=attempt)
         if state.phase == "grasp":
             plan = _plan_take(env, truth, attempt)
             return ExpertState("carry", plan, attempt=attempt + 1)
-        return ExpertState("grasp", (_retreat_waypoint(env),), attempt=attempt)
+        return ExpertState(
+            "grasp",
+            (Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.06), 1.0, 0.1),),
+            attempt=attempt,
+        )
 
 
 def _step_towards(waypoint: Waypoint, env: Env) -> Action:
@@ -190,7 +197,11 @@ def _plan_take(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
     """Over the target, down, close, and up until it is clear of everything."""
     low = _grasp_pose(env, truth, attempt)
     above = _clear_pose(env, truth, low)
-    lift_m = _height_of_others(env, truth) - _foot_height(truth, env.row.target) + 0.015
+    lift_m = (
+        _height_of_others(env, truth)
+        - float(points_world(env.row.target, truth.objects_world[env.row.target])[:, 2].min())
+        + 0.015
+    )
     lift = _raised_within_reach(env, low, max(0.09, lift_m))
     return (
         Waypoint(above, 1.0),
@@ -259,9 +270,9 @@ def _plan_touch(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
     if attempt % 2:
         place = points[points[:, 2] > top - 0.006].mean(axis=0)
     tip = np.array([place[0], place[1], top - 0.025])
-    poses = []
-    for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist():
-        poses.append(_pointing_down(env, tip, yaw))
+    poses = [
+        _pointing_down(env, tip, yaw) for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist()
+    ]
     pose = _first_within_reach(env, _nearest_turn_first(env, poses), 0.02)
     if pose is None:
         raise OutOfReach(
@@ -271,14 +282,6 @@ def _plan_touch(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
     height = _height_of_others(env, truth) + ABOVE_M - (top - 0.025)
     above = _raised_within_reach(env, pose, height)
     return Waypoint(above, 0.0), Waypoint(pose, 0.0, 0.2), Waypoint(above, 0.0)
-
-
-def _hold_waypoint(env: Env) -> Waypoint:
-    return Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0, 0.5)
-
-
-def _retreat_waypoint(env: Env) -> Waypoint:
-    return Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.06), 1.0, 0.1)
 
 
 def _grasp_pose(env: Env, truth: Truth, attempt: int) -> TcpPose:
@@ -305,9 +308,7 @@ def _pose_of_grasp(env: Env, grasp: Grasp) -> TcpPose | None:
 
     The hand turns the shorter way.
     """
-    poses = []
-    for turn in (0.0, np.pi):
-        poses.append(_pointing_down(env, grasp.tcp_world, grasp.axis_rad + turn))
+    poses = [_pointing_down(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
     for pose in _nearest_turn_first(env, poses):
         pose[:3, 3] -= pose[:3, 1] * _shift_to_fixed_jaw(env, grasp)
         reached = _within_reach(env, pose, 0.003)
@@ -440,10 +441,6 @@ def _height_of_others(env: Env, truth: Truth) -> float:
             points = points_world(name, pose)
             heights.append(float(points[:, 2].max()))
     return max(heights)
-
-
-def _foot_height(truth: Truth, name: str) -> float:
-    return float(points_world(name, truth.objects_world[name])[:, 2].min())
 
 
 def _pointing_down(env: Env, tcp_world: Float64[np.ndarray, "3"], axis_rad: float) -> TcpPose:

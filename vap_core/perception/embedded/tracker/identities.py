@@ -163,9 +163,10 @@ def tracks_of(state: TrackState) -> tuple[Track, ...]:
 
     The score of an identity without a mask says how sure it is that it is not visible.
     """
-    tracks: list[Track] = []
-    for mask, score, lost in zip(state.masks, state.scores, state.lost, strict=True):
-        tracks.append(Track(None if lost else mask.copy(), float(np.clip(score, 0, 1))))
+    tracks = [
+        Track(None if lost else mask.copy(), float(np.clip(score, 0, 1)))
+        for mask, score, lost in zip(state.masks, state.scores, state.lost, strict=True)
+    ]
     return tuple(tracks)
 
 
@@ -225,7 +226,13 @@ def update_state(
     thumbnails = list(state.thumbnails)
     last_crops = list(state.last_crops)
     last_rows = list(state.last_rows)
-    masks = _compete(state, probability, judged)
+    # New masks of the judged identities: likely pixels that no other identity claims more.
+    masks = state.masks.copy()
+    claiming = np.flatnonzero(state.followed)  # the others claim nothing
+    winner = argmax_planes(probability[claiming])
+    for place, identity in enumerate(claiming):
+        if identity in judged:
+            masks[identity] = (probability[identity] > 0.5) & (winner == place)
     for i in judged:
         box = mask_box(masks[i])
         evidence = _evidence_of_size(state, frame, int(i), masks[i])
@@ -266,21 +273,6 @@ def update_state(
         last_crops=tuple(last_crops),
         last_rows=tuple(last_rows),
     )
-
-
-def _compete(
-    state: TrackState,
-    probability: Float32[np.ndarray, "n h w"],
-    judged: Int64[np.ndarray, " k"],
-) -> np.ndarray:
-    """New masks of the judged identities: likely pixels that no other identity claims more."""
-    masks = state.masks.copy()
-    claiming = np.flatnonzero(state.followed)  # the others claim nothing
-    winner = argmax_planes(probability[claiming])
-    for place, identity in enumerate(claiming):
-        if identity in judged:
-            masks[identity] = (probability[identity] > 0.5) & (winner == place)
-    return masks
 
 
 def _evidence_of_size(state: TrackState, frame: FrameFeatures, identity: int, mask: Mask) -> float:
@@ -342,7 +334,10 @@ def search(
     box = _seed_box(free, share)
     if box is None:
         return state, absence
-    box = _limit_size(box, state.boxes[identity])
+    last_box = state.boxes[identity]
+    middle = (box[:2] + box[2:]) / 2
+    half = np.minimum((box[2:] - box[:2]) / 2, MAX_SWELL * (last_box[2:] - last_box[:2]) / 2)
+    box = np.concatenate([middle - half, middle + half]).astype(np.float32)
     drawn, box = _draw(frame, segmenter, box, free, taken)
     if box is None or evidence_for(state, frame, identity, drawn > 0.5) < FOUND_EVIDENCE:
         return state, absence
@@ -377,18 +372,6 @@ def _seed_box(
     if seed is None:
         return None
     return mask_box(cv2.dilate(seed.astype(np.uint8), np.ones((SEED_GROWTH_PX,) * 2)) > 0)
-
-
-def _limit_size(
-    box: Float32[np.ndarray, "4"], last_box: Float32[np.ndarray, "4"]
-) -> Float32[np.ndarray, "4"]:
-    """The box, cut about its middle where it is `MAX_SWELL` times as wide or high as the last one.
-
-    What is behind the object would otherwise be taken for it.
-    """
-    middle = (box[:2] + box[2:]) / 2
-    half = np.minimum((box[2:] - box[:2]) / 2, MAX_SWELL * (last_box[2:] - last_box[:2]) / 2)
-    return np.concatenate([middle - half, middle + half]).astype(np.float32)
 
 
 def _draw(
