@@ -127,6 +127,10 @@ class BadPolicy(VapError):
     execute code, or does not fit the suite."""
 
 
+class BadPlan(BadPolicy):
+    """What a policy returned for some episodes is not a chunk of actions for each."""
+
+
 class BadEndpoint(VapError):
     """A chat endpoint that cannot be reached, refuses, or does not follow the protocol."""
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadPolicy, BadStudy, one_of
+from vap_core.base.errors import BadPlan, BadPolicy, BadStudy, one_of
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.protocol import (
     ACTION,
@@ -96,28 +96,28 @@ def check_policy(policy: Any) -> None:
 def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[Any]]:
     """The states that the policy `label` returned for `n` episodes, and what `check_chunks` checks.
 
-    Raises: BadPolicy when it returned something else, or not one of each for every episode.
+    Raises: BadPlan when it returned something else, or not one of each for every episode.
     """
     if not isinstance(returned, tuple | list) or len(returned) != 2:
-        raise BadPolicy(
+        raise BadPlan(
             f"{label}: plan returned {type(returned).__name__}; return two lists, of states and of "
             "chunks."
         )
     states, chunks = returned
     for name, parts in (("states", states), ("chunks", chunks)):
         if not isinstance(parts, list | tuple | np.ndarray):
-            raise BadPolicy(
+            raise BadPlan(
                 f"{label}: plan returned {type(parts).__name__} for the {name}; return a list."
             )
         if len(parts) != n:
-            raise BadPolicy(
+            raise BadPlan(
                 f"{label}: plan returned {len(parts)} {name} for {n} episodes; return one for each."
             )
     return list(states), list(chunks)
 
 
 def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[str]) -> None:
-    """Raises: BadPolicy when a chunk is no float32 array with `action_names` in every row."""
+    """Raises: BadPlan when a chunk is no float32 array with `action_names` in every row."""
     size = len(action_names)
     for chunk in chunks:
         found = type(chunk).__name__
@@ -126,7 +126,7 @@ def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[st
             if fits and chunk.dtype == np.float32:
                 continue
             found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
-        raise BadPolicy(
+        raise BadPlan(
             f"{label}: plan returned {found} as a chunk; return a NumPy array of type float32 and "
             f"shape (steps, {size}), in every row {', '.join(action_names)}."
         )

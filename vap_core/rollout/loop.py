@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vap_core.base.errors import BadAction, BadCrop, BadStudy, OutOfReach, VapError
+from vap_core.base.errors import BadAction, BadCrop, BadPlan, BadStudy, OutOfReach, VapError
 from vap_core.base.types import Attended, Views
 from vap_core.policies.protocol import (
     AttentionMaps,
@@ -555,9 +555,9 @@ def _fail(episode: RunningEpisode) -> None:
 def _ends_the_run(error: BaseException) -> bool:
     """Whether the user has to act (a full disk, an absent weight).
 
-    A bad action, and a crop that cannot be embedded, fail their own episode only.
+    A bad action or plan, and a crop that cannot be embedded, fail their own episode only.
     """
-    of_episode = isinstance(error, OutOfReach | BadAction | BadCrop)
+    of_episode = isinstance(error, OutOfReach | BadAction | BadCrop | BadPlan)
     return isinstance(error, VapError) and not of_episode
 
 
