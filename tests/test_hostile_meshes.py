@@ -82,7 +82,7 @@ def test_fewer_texture_coordinates_than_vertices_are_refused(tmp_path: Path) -> 
 def test_a_mesh_placed_a_million_times_is_counted_before_it_is_copied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_parts.MAX_FACES", 100)
+    monkeypatch.setattr("vap_core.simulation.assets.scans.mesh_file.MAX_FACES", 100)
     monkeypatch.setattr(trimesh.Scene, "dump", lambda _: pytest.fail("copied"))
     scene = trimesh.Scene()
     for i in range(10):

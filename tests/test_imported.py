@@ -11,7 +11,8 @@ from tests.command import refused, vap
 from tests.scanned import mug, put
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.simulation.assets import objects
-from vap_core.simulation.assets.scans import convex_parts, storage
+from vap_core.simulation.assets.scans import import_scan as importing
+from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.import_scan import default_name, import_scan
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.scenes import build
@@ -56,7 +57,7 @@ def test_an_imported_mug_is_an_object_like_any_other(shelf):
     assert objects.extent_m(model) == pytest.approx((0.07, 0.07, 0.09), abs=1e-6)
     assert objects.mesh_of(model).vertex[:, 2].min() == pytest.approx(0, abs=1e-9)
     solids = model.form.solids()
-    assert 4 <= len(solids) <= convex_parts.HULLS
+    assert 4 <= len(solids) <= importing.HULLS
     assert model.mass_kg == pytest.approx(
         np.clip(400 * sum(hull.volume for hull in solids), 0.03, 0.5), abs=1e-4
     )

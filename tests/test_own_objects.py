@@ -13,10 +13,9 @@ from tqdm import tqdm
 from tests.command import refused, vap
 from tests.scanned import box, put
 from vap_core.base.errors import BadObject, BadOutput, BadStudy
-from vap_core.simulation.assets.scans.mesh_file import _weld
-from vap_core.simulation.assets.scans.mesh_repair import count_edge_flaws
+from vap_core.simulation.assets.scans.mesh_file import count_edge_flaws, weld
 from vap_core.simulation.assets.scans.storage import VARIABLE
-from vap_core.simulation.assets.triangles import area_vectors
+from vap_core.simulation.assets.shapes import area_vectors
 from vap_core.simulation.suites import suite
 from vap_core.study import objects as own
 from vap_core.study.objects import (
@@ -47,14 +46,14 @@ def volume(corner: np.ndarray) -> float:
     ],
 )
 def test_forms_are_closed_and_have_their_volumes(corner, wanted):
-    assert count_edge_flaws(_weld(corner)[1]) == (0, 0)
+    assert count_edge_flaws(weld(corner)[1]) == (0, 0)
     assert volume(corner) == pytest.approx(wanted, rel=0.1)
 
 
 def test_a_vessel_is_its_wall():
     vessel = hollow([(0.02, 0.0), (0.02, 0.06)], 0.003)
     solid = lathe([(0, 0), (0.02, 0), (0.02, 0.06), (0, 0.06)])
-    assert count_edge_flaws(_weld(vessel)[1]) == (0, 0)
+    assert count_edge_flaws(weld(vessel)[1]) == (0, 0)
     assert 0 < volume(vessel) < 0.5 * volume(solid)
 
 
@@ -63,7 +62,7 @@ def test_every_design_of_every_kind_is_closed():
     for forms in FORMS.values():
         for name, form in forms:
             for part in form(rng):
-                assert count_edge_flaws(_weld(part)[1]) == (0, 0), name
+                assert count_edge_flaws(weld(part)[1]) == (0, 0), name
                 assert volume(part) > 0
             size = np.ptp(np.concatenate(form(rng)), axis=(0, 1))
             assert (size > 0.015).all(), name
@@ -203,7 +202,7 @@ def test_the_command_imports_looks_runs_and_resumes(tmp_path):
     again = vap(*words)
     assert again.stdout == done.stdout
     assert parts == {path: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
-    assert "holds another run" in refused(*words[:2], "--episodes", "2", "--out", out)
+    assert "holds another run" in refused(*words[:3], "--episodes", "2", "--out", out)
 
 
 def view(**changed: object) -> dict[str, object]:

@@ -90,7 +90,7 @@ def test_whatever_a_decoder_raises_is_one_line(
     def decode(data: bytes) -> None:
         raise kind("odd")
 
-    monkeypatch.setattr(storage, "_decode_mesh", decode)
+    monkeypatch.setitem(storage.DECODERS, storage.MESH_FILE, decode)
     with pytest.raises(BadObject, match=r"mesh.npz lacks what an object needs \(odd\)"):
         storage._load_version(shelf / "mug", -1)
 

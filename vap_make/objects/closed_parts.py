@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from vap_core.simulation.assets.triangles import area_vectors
+from vap_core.simulation.assets.shapes import area_vectors
 
 Corners = Float[np.ndarray, "f 3 3"]
 Number = float | int

@@ -15,6 +15,9 @@ Vector = tuple[Number, Number, Number]
 """A position or three half-sizes, metres."""
 Srgb = tuple[int, int, int]
 """A colour, 0..255 a channel."""
+Vertices = Float[np.ndarray, "n 3"]
+Faces = Int[np.ndarray, "f 3"]
+"""Vertex numbers of each triangle, counter-clockwise seen from outside."""
 
 
 @value
@@ -120,3 +123,8 @@ def rotation_matrix(x: Number = 0, y: Number = 0, z: Number = 0) -> np.ndarray:
     about_y = np.array([[cos_y, 0, sin_y], [0, 1, 0], [-sin_y, 0, cos_y]])
     about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
     return about_z @ about_y @ about_x
+
+
+def area_vectors(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
+    """Normals of triangles, as long as twice their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

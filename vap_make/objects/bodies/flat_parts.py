@@ -6,7 +6,7 @@ Lengths are metres. `swatch` is a number of `textures`, or `DECORATED` for the d
 import numpy as np
 from jaxtyping import Float
 
-from vap_core.simulation.assets.triangles import area_vectors
+from vap_core.simulation.assets.shapes import area_vectors
 from vap_make.objects.shapes import Mesh, Number, join_meshes
 from vap_make.objects.textures import BASE, DECORATED, DECORATION_SHARE, swatch_uv
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from vap_core.simulation.assets.triangles import area_vectors
+from vap_core.simulation.assets.shapes import area_vectors
 from vap_make.objects.bodies.turned import grid_faces
 from vap_make.objects.shapes import Mesh, Number, Solid
 from vap_make.objects.textures import DECORATED, decoration_v, swatch_uv

@@ -2,41 +2,57 @@
 
 The file is read, checked, set upright, reduced, textured, and split into convex parts. The result
 stands on z = 0, centred on the z axis, z up, metres; its collision solids are the hulls of a convex
-decomposition.
+decomposition. As a script this module is that decomposition: CoACD cannot be interrupted, but the
+system ends a process that has used its seconds of CPU.
 """
 
 import re
+import resource
 import shlex
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
+from PIL import Image
+from scipy.spatial import ConvexHull, QhullError
 
 from vap_core import __version__
 from vap_core.base.errors import BadObject, bounded
 from vap_core.memory import NAME, NAME_RULE, kind_instead, plain_category
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.assets.scans.bake import (
-    ColouredPoints,
+from vap_core.simulation.assets.scans.mesh_file import (
+    ScannedSurface,
     bake_texture,
+    close_surface,
+    count_edge_flaws,
     creased_mesh,
-    shrink_image,
+    read_mesh_file,
 )
-from vap_core.simulation.assets.scans.convex_parts import SOLIDIFY, convex_parts
-from vap_core.simulation.assets.scans.mesh_file import ScannedSurface, read_mesh_file
-from vap_core.simulation.assets.scans.mesh_repair import close_surface, count_edge_flaws
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
-from vap_core.simulation.assets.triangles import area_vectors, decimate
+from vap_core.simulation.assets.shapes import Faces, Hull, Vertices, area_vectors
 from vap_core.simulation.types import REST, ROBOT
 
 VISUAL_FACES, TEXTURE_PX = 3000, 1024
 MEMORY_BYTES, CPU_LIMIT_S = 6_000_000_000, 300.0
 """What an import may take; the convex decomposition has its own limits."""
+HULLS, HULL_CORNERS = 16, 160
+SPLIT_CPU_S, SPLIT_WALL_S = 60, 900
+"""A surface that does not cross itself takes about ten seconds of CPU; a busy machine gives them
+late."""
+SLIVER_M3 = 1e-9
+"""A convex part of less volume is dropped."""
+SOLIDIFY = "give it thickness in your 3-D tool (solidify)"
+SCRIPT = Path(__file__)
 MOST_VISUAL_FACES = 5 * VISUAL_FACES
 """A surface of which more faces remain than this is refused: it crosses itself all over."""
 SMALLEST_M, LARGEST_M, THINNEST_M = 0.01, 0.6, 0.002
@@ -85,7 +101,7 @@ def import_scan(
             surface = read_mesh_file(path, colour)
             if repair:
                 vertex, face = close_surface(surface.vertex, surface.face)
-                surface = ScannedSurface(vertex, face, surface.samples)
+                surface = ScannedSurface(vertex, face, surface.point, surface.rgb)
             _check_closed(surface, path, repair)
             if up is None:
                 up = guess_up(surface, path)
@@ -136,36 +152,33 @@ def _flat_below(surface: ScannedSurface, up: UpAxis) -> float:
 
 
 def _check_arguments(name: str, category: str, mass_kg: float | None) -> None:
+    kind, flaw = kind_instead(category), ""
     if not NAME.fullmatch(name):
-        raise BadObject(
-            f"objects: {name!r} cannot name an object; use {NAME_RULE}, for example --name my-mug."
+        flaw = f"{name!r} cannot name an object; use {NAME_RULE}, for example --name my-mug"
+    elif name in objects.OBJECTS or "-generic-" in name:
+        flaw = f"{name!r} is one of the workspace's own objects; choose another --name"
+    elif name in _scene_names():
+        flaw = (
+            f"{name!r} is what a part of the room or of a robot is called; choose another --name, "
+            f"for example my-{name}"
         )
-    if name in objects.OBJECTS or "-generic-" in name:
-        raise BadObject(
-            f"objects: {name!r} is one of the workspace's own objects; choose another --name, for "
-            f"example my-{name}."
+    elif name.endswith(objects.RED):
+        flaw = (
+            f"a name that ends in {objects.RED} is of an object that was made red; choose another "
+            "--name"
         )
-    if name in _scene_names():
-        raise BadObject(
-            f"objects: {name!r} is what a part of the room or of a robot is called; choose another "
-            f"--name, for example my-{name}."
+    elif kind:
+        flaw = (
+            f"{category!r} cannot be a category; name the kind of thing alone, in words, for "
+            f"example --category {shlex.quote(kind)}"
         )
-    if name.endswith(objects.RED):
-        raise BadObject(
-            f"objects: a name that ends in {objects.RED} is of an object that was made red; choose "
-            "another --name."
+    elif mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
+        flaw = (
+            f"a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg between 0 and "
+            f"{HEAVIEST_KG}"
         )
-    kind = kind_instead(category)
-    if kind:
-        raise BadObject(
-            f"objects: {category!r} cannot be a category; name the kind of thing alone, in words, "
-            f"for example --category {shlex.quote(kind)}."
-        )
-    if mass_kg is not None and not 0 < mass_kg <= HEAVIEST_KG:
-        raise BadObject(
-            f"objects: a mass of {mass_kg:g} kg is beyond what the arms lift; give --mass-kg "
-            f"between 0 and {HEAVIEST_KG}."
-        )
+    if flaw:
+        raise BadObject(f"objects: {flaw}.")
 
 
 @cache
@@ -212,20 +225,17 @@ def _set_upright(
     _check_size(size, path, height_cm)
     base = np.array([*(low + high)[:2] / 2, low[2]])
     vertex = scale * (turned - base)
-    volume_m3 = _enclosed_volume(vertex[surface.face])
+    corner = vertex[surface.face]
+    volume_m3 = float((corner[:, 0] * area_vectors(corner)).sum() / 6)  # < 0: it faces inwards
     if abs(volume_m3) < 1e-4 * float(np.prod(size)) or abs(volume_m3) < 1e-9:
         raise BadObject(
             f"objects: {path} encloses no volume ({1e6 * abs(volume_m3):.3g} cm3); {SOLIDIFY}."
         )
-    samples = ColouredPoints(
-        point=scale * (surface.samples.point @ rotation.T - base), rgb=surface.samples.rgb
-    )
-    upright = replace(surface, vertex=vertex, samples=samples)
+    point = scale * (surface.point @ rotation.T - base)
+    upright = replace(surface, vertex=vertex, point=point)
     if volume_m3 > 0:
         return upright
-    uv = surface.uv
-    if uv is not None:
-        uv = uv[:, ::-1].copy()
+    uv = None if surface.uv is None else surface.uv[:, ::-1].copy()
     return replace(upright, face=surface.face[:, ::-1].copy(), uv=uv)
 
 
@@ -246,11 +256,6 @@ def _check_size(size: np.ndarray, path: Path, height_cm: float | None) -> None:
         )
 
 
-def _enclosed_volume(corner: np.ndarray) -> float:
-    """Cubic metres inside a closed surface; negative where its triangles face inwards."""
-    return float((corner[:, 0] * area_vectors(corner)).sum() / 6)
-
-
 def _format_length(metres: float) -> str:
     if metres >= 1000:
         return f"{metres / 1000:.3g} km"
@@ -261,22 +266,96 @@ def _format_length(metres: float) -> str:
 
 def _build_scan(surface: ScannedSurface, report: Callable[[str], None]) -> Scan:
     """The surface reduced, textured, and split into convex parts."""
+    from fast_simplification import simplify
+
     vertex, face = surface.vertex, surface.face
     if len(face) > VISUAL_FACES:
         report(f"reducing {len(face):,} faces to {VISUAL_FACES:,} ...")
-        vertex, face = decimate(vertex, face, VISUAL_FACES)
+        fewer, face = simplify(vertex, face.astype(np.int32), target_count=VISUAL_FACES, agg=3.0)
+        face = np.asarray(face, np.int64)
         if len(face) > MOST_VISUAL_FACES:
             raise BadObject(
                 f"objects: the surface cannot be reduced to {VISUAL_FACES:,} faces, {len(face):,} "
                 "remain; smooth or remesh it in your 3-D tool."
             )
-        vertex = np.clip(vertex, surface.vertex.min(axis=0), surface.vertex.max(axis=0))
+        vertex = np.clip(np.asarray(fewer, np.float64), vertex.min(axis=0), vertex.max(axis=0))
     unchanged = len(face) == len(surface.face)
     if unchanged and surface.uv is not None and surface.picture is not None:
         form = creased_mesh(vertex, face, surface.uv)
-        image = shrink_image(surface.picture, TEXTURE_PX)
+        picture = Image.fromarray(surface.picture)
+        picture.thumbnail((TEXTURE_PX, TEXTURE_PX))
+        image = np.array(picture)
     else:
         report("painting a texture ...")
-        form, image = bake_texture(vertex, face, surface.samples, TEXTURE_PX)
+        form, image = bake_texture(vertex, face, surface, TEXTURE_PX)
     report("splitting into convex parts, some seconds ...")
     return Scan(form=form, hulls=convex_parts(vertex, face), image=image)
+
+
+def convex_parts(vertex: Vertices, face: Faces) -> tuple[Hull, ...]:
+    """Convex parts that cover the body.
+
+    They stay inside its bounding box, so that it stands where its mesh stands.
+
+    Raises: BadObject: no part has a volume, or the time limit passed.
+    """
+    hulls = []
+    for corners in _split(vertex, face):
+        inside = np.clip(corners, vertex.min(axis=0), vertex.max(axis=0))
+        with suppress(QhullError):  # a part as flat as paper
+            convex = ConvexHull(inside)
+            if convex.volume > SLIVER_M3:
+                hulls.append(Hull(inside[convex.vertices], float(convex.volume)))
+    if not hulls:
+        raise BadObject(f"objects: no convex part of this object has a volume; {SOLIDIFY}.")
+    return tuple(hulls)
+
+
+def _split(vertex: Vertices, face: Faces) -> list[np.ndarray]:
+    """The corners of every part, found in a process of its own. Raises: BadObject."""
+    with TemporaryDirectory(prefix="vap-convex-") as folder:
+        source, target = Path(folder, "surface.npz"), Path(folder, "parts.npz")
+        np.savez(source, vertex=vertex, face=face)
+        words = [sys.executable, "-I", SCRIPT, source, target, SPLIT_CPU_S]
+        try:
+            status = subprocess.run(
+                [*map(str, words)], capture_output=True, timeout=SPLIT_WALL_S
+            ).returncode
+        except subprocess.TimeoutExpired:
+            status = -signal.SIGKILL
+        if status in (-signal.SIGXCPU, -signal.SIGKILL):
+            raise BadObject(
+                f"objects: splitting the surface into convex parts took over {SPLIT_CPU_S} s, so "
+                "it most likely crosses itself; remesh or smooth it in your 3-D tool."
+            )
+        if status or not target.exists():
+            raise BadObject(
+                f"objects: the surface cannot be split into convex parts (status {status}); "
+                "remesh it in your 3-D tool."
+            )
+        with np.load(target) as parts:
+            return [parts[name] for name in parts.files]
+
+
+def _decompose(source: str, target: str, seconds: str) -> None:
+    """CoACD's convex parts of the surface in one .npz file, into another."""
+    resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds)))
+    import coacd
+
+    surface = np.load(source)
+    coacd.set_log_level("off")
+    parts = coacd.run_coacd(
+        coacd.Mesh(surface["vertex"], surface["face"]),
+        threshold=0.1,
+        preprocess_resolution=30,
+        mcts_iterations=60,
+        max_convex_hull=HULLS,
+        decimate=True,
+        max_ch_vertex=HULL_CORNERS,
+        seed=0,
+    )
+    np.savez(target, *(vertex for vertex, _ in parts))
+
+
+if __name__ == "__main__":
+    _decompose(*sys.argv[1:])

@@ -1,44 +1,56 @@
-"""What a GLB, OBJ, PLY or STL file holds: one welded surface, and the colours on it."""
+"""What a GLB, OBJ, PLY or STL file holds: one welded surface, closed if asked, and its colours.
 
-from collections.abc import Callable, Sequence
+A surface without a usable texture gets a new one: it is unfolded into flat charts, these are
+packed, and every texel gets the colour of the nearest coloured point.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from PIL import ImageColor
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image, ImageColor, UnidentifiedImageError
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from vap_core.base.errors import BadObject
+from vap_core.base.media import MAX_PIXELS, PICTURE_FORMATS
 from vap_core.base.types import Rgb, value
-from vap_core.simulation.assets.scans.bake import ColouredPoints, CornerPoints
-from vap_core.simulation.assets.scans.mesh_parts import check_file, load_parts
-from vap_core.simulation.assets.triangles import Faces, Vertices, area_vectors
+from vap_core.simulation.assets.shapes import Faces, Mesh, Vertices, area_vectors
 
 if TYPE_CHECKING:
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
+SUFFIXES = (".glb", ".obj", ".ply", ".stl")
+MAX_MB, MAX_FACES = 200, 500_000
 SMALLEST_AREA = 1e-24
 """A surface of less, in square units of its file, is a point to the arithmetic."""
 SAMPLES = 600_000
 """Coloured points that are taken from a surface."""
-ColourLookup = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Colours (n, 3) in 0..255 of points on one part of a file.
-
-A point is given by its triangle's number (n) and its barycentric coordinates there (n, 3).
-"""
+SMALLEST_PIECE = 0.02
+"""Repair drops a separate piece with less than this share of the area."""
+GUTTER_PX = 3
+CREASE_COSINE = float(np.cos(np.radians(40)))
+"""Neighbouring triangles that meet at a flatter angle than this are shaded as one surface."""
+CornerPoints = Float[np.ndarray, "f 3 2"]
+"""A point of the plane for every corner of every triangle."""
 
 
 @value
 class ScannedSurface:
     """A file's triangles welded into one surface, in the file's own units and axes.
 
-    `samples` are its colours. `uv` and `picture` are set when the file has exactly one texture:
-    they can be kept as they are.
+    `point` and `rgb` are its colours at points all over it. `uv` and `picture` are set when the
+    file has exactly one texture: they can be kept as they are.
     """
 
     vertex: Vertices
     face: Faces
-    samples: ColouredPoints
+    point: Float[np.ndarray, "p 3"]
+    rgb: UInt8[np.ndarray, "p 3"]
     uv: CornerPoints | None = None
     picture: Rgb | None = None
 
@@ -49,7 +61,20 @@ def read_mesh_file(path: Path, colour: str | None = None) -> ScannedSurface:
     Raises:
         BadObject: the file is missing, damaged, too large or colourless.
     """
-    check_file(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise BadObject(
+            f"objects: {path} is no GLB, OBJ, PLY or STL file; export it as one of them."
+        )
+    if not path.is_file() or not path.stat().st_size:
+        flaw = "not there"
+        if path.exists():
+            flaw = "empty" if path.is_file() else "no regular file"
+        raise BadObject(f"objects: {path} is {flaw}; check the path, or export it again.")
+    if path.stat().st_size > MAX_MB * 1e6:
+        raise BadObject(
+            f"objects: {path} has {path.stat().st_size / 1e6:.0f} MB, over {MAX_MB}; decimate it "
+            "or shrink its texture."
+        )
     try:
         return _read_surface(path, colour)
     except BadObject:
@@ -62,7 +87,7 @@ def read_mesh_file(path: Path, colour: str | None = None) -> ScannedSurface:
 
 
 def _read_surface(path: Path, colour: str | None) -> ScannedSurface:
-    parts = load_parts(path)
+    parts = _load_parts(path)
     corner = np.concatenate([np.asarray(part.triangles, np.float64) for part in parts])
     if not np.isfinite(corner).all():
         raise BadObject(f"objects: {path} has vertices that are not numbers; export it again.")
@@ -72,19 +97,107 @@ def _read_surface(path: Path, colour: str | None) -> ScannedSurface:
             f"objects: {path} has triangles of {area / 2:.3g} square units in all, so it is no "
             "surface; export it again, in metres."
         )
-    vertex, face, alive = _weld(corner)
+    vertex, face, alive = weld(corner)
     if not len(face):
         raise BadObject(f"objects: {path} has only triangles that vanish; export it again.")
-    samples = _sample_colours(corner, parts, _colour_lookups(path, parts, colour))
+    point, rgb = _sample_colours(path, corner, parts, colour)
     visual: Any = parts[0].visual
     picture = _texture_picture(visual)
     if len(parts) > 1 or colour is not None or picture is None:
-        return ScannedSurface(vertex, face, samples)
+        return ScannedSurface(vertex, face, point, rgb)
     uv = (np.asarray(visual.uv, np.float64) * (1, -1) + (0, 1))[parts[0].faces][alive]
-    return ScannedSurface(vertex, face, samples, uv=uv, picture=picture)
+    return ScannedSurface(vertex, face, point, rgb, uv, picture)
 
 
-def _weld(
+def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
+    """The file's meshes that have triangles, in one frame.
+
+    Raises: BadObject: there is none, there are too many, or they are inconsistent.
+    """
+    import trimesh
+
+    with _checked_pictures() as refused:
+        scene = trimesh.load_scene(path, resolver=_beside(path))
+    if refused:
+        raise BadObject(f"objects: {path} has a texture that {refused[0]}.")
+    meshes = {
+        name: mesh
+        for name, mesh in scene.geometry.items()
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+    }
+    for mesh in meshes.values():
+        face, points = np.asarray(mesh.faces), len(mesh.vertices)
+        uv = getattr(mesh.visual, "uv", None)
+        if face.ndim != 2 or face.shape[1] != 3 or face.min() < 0 or face.max() >= points:
+            raise BadObject(
+                f"objects: {path} has faces that name vertices that are not there; export it again."
+            )
+        if uv is not None and (np.shape(uv) != (points, 2) or not np.isfinite(uv).all()):
+            raise BadObject(
+                f"objects: {path} has texture coordinates that do not fit its vertices; unwrap the "
+                "mesh and export it again."
+            )
+    placed = [scene.graph[node][1] for node in scene.graph.nodes_geometry]  # some many times
+    count = sum(len(meshes[name].faces) for name in placed if name in meshes)
+    if not count:
+        raise BadObject(f"objects: {path} holds no triangles; export the object as a mesh.")
+    if count > MAX_FACES:
+        raise BadObject(
+            f"objects: {path} has {count:,} faces, over {MAX_FACES:,}; decimate it first, a "
+            "hundred thousand are plenty."
+        )
+    return [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+
+
+def _beside(path: Path) -> "FilePathResolver":
+    """Opens what the mesh refers to: regular files in its folder and below, of MAX_MB at most."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Bounded(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            for candidate in (name.strip(), Path(name.strip()).name):
+                with suppress(ValueError):  # outside the folder
+                    found = self.absolute(candidate)
+                    if found.is_file() and found.stat().st_size <= MAX_MB * 1e6:
+                        return found.read_bytes()
+            raise FileNotFoundError(name)
+
+    return Bounded(str(path))
+
+
+@contextmanager
+def _checked_pictures() -> Iterator[list[str]]:
+    """Inside the block Pillow opens PICTURE_FORMATS up to MAX_PIXELS alone, whoever calls it.
+
+    The readers of meshes open textures themselves, and go on without those that fail. The list
+    says what was wrong with each.
+    """
+    unchecked = Image.open
+    refused = []
+    most = f"over {MAX_PIXELS / 1e6:.0f} million"
+
+    def checked(file: Any, *_: Any, **__: Any) -> Image.Image:
+        try:
+            image = unchecked(file, formats=PICTURE_FORMATS)
+        except UnidentifiedImageError:
+            refused.append(f"is none of {', '.join(PICTURE_FORMATS)}; save it as JPEG or PNG")
+            raise
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+            refused.append(f"has {most} pixels; shrink it")
+            raise
+        if image.width * image.height > MAX_PIXELS:
+            refused.append(f"has {image.width}x{image.height} pixels, {most}; shrink it")
+            raise Image.DecompressionBombError(refused[-1])
+        return image
+
+    Image.open = checked  # type: ignore[assignment]
+    try:
+        yield refused
+    finally:
+        Image.open = unchecked
+
+
+def weld(
     corner: Float[np.ndarray, "f 3 3"],
 ) -> tuple[Vertices, Int[np.ndarray, "k 3"], Bool[np.ndarray, " f"]]:
     """Vertices, faces, and which of the given triangles they keep.
@@ -117,17 +230,37 @@ def _texture_picture(visual: Any) -> Rgb | None:
     return np.array(rgb)
 
 
-def _colour_lookups(
-    path: Path, parts: "Sequence[trimesh.Trimesh]", colour: str | None
-) -> list[ColourLookup]:
-    """A lookup for every part. Raises: BadObject when a part has no colours."""
-    lookups = []
+def _sample_colours(
+    path: Path,
+    corner: Float[np.ndarray, "f 3 3"],
+    parts: "list[trimesh.Trimesh]",
+    colour: str | None,
+) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
+    """Points all over the surface, equally dense everywhere, and their colours.
+
+    Raises: BadObject when a part has no colours, or `colour` is none.
+    """
+    import trimesh
+
+    whole = trimesh.Trimesh(corner.reshape(-1, 3), np.arange(corner.size // 3).reshape(-1, 3),
+                            process=False)  # fmt: skip
+    point, triangle, share = trimesh.sample.sample_surface(
+        whole, SAMPLES, return_barycentric=True, seed=7
+    )
+    rgb = np.zeros((SAMPLES, 3), np.uint8)
+    if colour is not None:
+        try:
+            rgb[:] = ImageColor.getrgb(colour)[:3]
+        except ValueError:
+            raise BadObject(
+                f"objects: {colour!r} is no colour; write it as --colour '#aa3322'."
+            ) from None
+        return point, rgb
+    first = 0
     for part in parts:
-        if colour is not None:
-            lookups.append(_uniform_colour(_parse_colour(colour)))
-            continue
-        lookup = _colour_lookup(part)
-        if lookup is None:
+        mine = (triangle >= first) & (triangle < first + len(part.faces))
+        found = _colours(part, triangle[mine] - first, share[mine])
+        if found is None:
             hint = ""
             if path.suffix.lower() == ".obj":
                 hint = " (an OBJ needs its .mtl and picture beside it)"
@@ -135,79 +268,203 @@ def _colour_lookups(
                 f"objects: {path} has no texture, UV map or vertex colours; bake a texture in your "
                 f"3-D tool{hint}, or pass --colour '#aa3322'."
             )
-        lookups.append(lookup)
-    return lookups
+        rgb[mine] = np.clip(found, 0, 255)
+        first += len(part.faces)
+    return point, rgb
 
 
-def _parse_colour(colour: str) -> np.ndarray:
-    try:
-        return np.array(ImageColor.getrgb(colour)[:3])
-    except ValueError:
-        raise BadObject(
-            f"objects: {colour!r} is no colour; write it as --colour '#aa3322'."
-        ) from None
-
-
-def _colour_lookup(part: "trimesh.Trimesh") -> ColourLookup | None:
-    """How to colour a point of a part: by its texture, its vertices, or its material."""
+def _colours(
+    part: "trimesh.Trimesh", triangle: Int[np.ndarray, " n"], share: Float[np.ndarray, "n 3"]
+) -> np.ndarray | None:
+    """By a part's texture, its vertices, or its material, at points with barycentric `share`s."""
     visual: Any = part.visual
-    face = np.asarray(part.faces)
+    corner = np.asarray(part.faces)[triangle]
     picture = _texture_picture(visual)
     if picture is not None:
-        return _textured(picture, np.asarray(visual.uv)[face])
-    if visual.kind in ("vertex", "face") and visual.defined:
-        return _vertex_coloured(np.asarray(visual.vertex_colors, np.float64)[:, :3][face])
-    material_colour = getattr(getattr(visual, "material", None), "baseColorFactor", None)
-    if material_colour is None:
-        return None
-    return _uniform_colour(np.asarray(material_colour)[:3])
-
-
-def _uniform_colour(rgb: np.ndarray) -> ColourLookup:
-    def look_up(triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(rgb, (len(triangle), 3))
-
-    return look_up
-
-
-def _vertex_coloured(corner_rgb: Float[np.ndarray, "f 3 3"]) -> ColourLookup:
-    def look_up(triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-        return np.einsum("nk,nkc->nc", barycentric, corner_rgb[triangle])
-
-    return look_up
-
-
-def _textured(picture: Rgb, corner_uv: Float[np.ndarray, "f 3 2"]) -> ColourLookup:
-    rows, cols, _ = picture.shape
-
-    def look_up(triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-        u, v = np.einsum("nk,nkc->cn", barycentric, corner_uv[triangle])
+        rows, cols, _ = picture.shape
+        u, v = np.einsum("nk,nkc->cn", share, np.asarray(visual.uv)[corner])
         row = np.floor((1 - v) % 1 * rows).astype(int) % rows
-        col = np.floor(u % 1 * cols).astype(int) % cols
-        return picture[row, col]
+        return picture[row, np.floor(u % 1 * cols).astype(int) % cols]
+    if visual.kind in ("vertex", "face") and visual.defined:
+        colours = np.asarray(visual.vertex_colors, np.float64)[:, :3]
+        return np.einsum("nk,nkc->nc", share, colours[corner])
+    flat = getattr(getattr(visual, "material", None), "baseColorFactor", None)
+    return None if flat is None else np.broadcast_to(np.asarray(flat)[:3], (len(triangle), 3))
 
-    return look_up
+
+def count_edge_flaws(face: Faces) -> tuple[int, int]:
+    """How many edges do not join exactly two triangles, and how many join two that face apart.
+
+    Two triangles face opposite ways where both run along their edge in the same direction.
+    """
+    edge = face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    number, uses = _edges(face)
+    paired = edge[(uses == 2)[number]]
+    return int((uses != 2).sum()), len(paired) - len(np.unique(paired, axis=0))
 
 
-def _sample_colours(
-    corner: Float[np.ndarray, "f 3 3"],
-    parts: "Sequence[trimesh.Trimesh]",
-    lookups: Sequence[ColourLookup],
-) -> ColouredPoints:
-    """Points all over the surface, equally dense everywhere, and their colours."""
-    area = np.linalg.norm(area_vectors(corner), axis=1)
-    rng = np.random.default_rng(7)
-    triangle = np.sort(rng.choice(len(corner), SAMPLES, p=area / area.sum()))
-    cut = np.sort(rng.random((SAMPLES, 2)), axis=1)
-    barycentric = np.stack([cut[:, 0], cut[:, 1] - cut[:, 0], 1 - cut[:, 1]], axis=1)
-    rgb, first = [], 0
-    for part, lookup in zip(parts, lookups, strict=True):
-        stop = first + len(part.faces)
-        start_row, stop_row = np.searchsorted(triangle, [first, stop])
-        rows = slice(start_row, stop_row)
-        rgb.append(lookup(triangle[rows] - first, barycentric[rows]))
-        first = stop
-    return ColouredPoints(
-        point=np.einsum("nk,nkc->nc", barycentric, corner[triangle]),
-        rgb=np.clip(np.concatenate(rgb), 0, 255).astype(np.uint8),
+def _edges(face: Faces) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " u"]]:
+    """The number of every triangle's three edges, and how many triangles each joins."""
+    edge = np.sort(face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, number, uses = np.unique(edge @ (1 << 31, 1), return_inverse=True, return_counts=True)
+    return number, uses
+
+
+def close_surface(
+    vertex: Vertices, face: Faces
+) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "k 3"]]:
+    """The surface as closed as simple means allow; `count_edge_flaws` shows what is left open.
+
+    Drops double triangles, small separate pieces and triangles at edges that join more than two;
+    turns triangles to face the same way, and caps holes.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertex, face, process=False)
+    mesh.update_faces(mesh.unique_faces())
+    piece = trimesh.graph.connected_component_labels(
+        mesh.face_adjacency, node_count=len(mesh.faces)
     )
+    area = np.bincount(piece, mesh.area_faces)
+    mesh.update_faces((area >= SMALLEST_PIECE * area.sum())[piece])
+    while True:
+        number, uses = _edges(np.asarray(mesh.faces))
+        crowded = (uses[number].reshape(-1, 3) > 2).any(axis=1)
+        if not crowded.any() or crowded.all():
+            break
+        mesh.update_faces(~crowded)
+    trimesh.repair.fix_winding(mesh)
+    kept = np.array(mesh.faces, np.int64)
+    number, uses = _edges(kept)
+    vertices, faces = [vertex], [kept]
+    for loop in _loops(kept[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)[(uses == 1)[number]]):
+        centre = np.full(len(loop), len(vertex) + len(vertices) - 1)
+        vertices.append(vertex[loop].mean(axis=0, keepdims=True))
+        faces.append(np.stack([np.roll(loop, -1), loop, centre], axis=1))
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _loops(boundary: Int[np.ndarray, "e 2"]) -> Iterator[Int[np.ndarray, " k"]]:
+    """Closed walks along directed edges that pass no vertex twice."""
+    onward: dict[int, list[int]] = {}
+    for start, end in boundary.tolist():
+        onward.setdefault(start, []).append(end)
+    for first in list(onward):
+        walk = [first]
+        while onward.get(walk[-1]):
+            step = onward[walk[-1]].pop()
+            if step in walk:
+                place = walk.index(step)
+                yield np.array(walk[place:])
+                del walk[place:]
+            walk.append(step)
+
+
+def creased_mesh(vertex: Vertices, face: Faces, uv: CornerPoints) -> Mesh:
+    """A mesh with smooth normals, creased where the surface turns sharply.
+
+    Vertices are shared where normal and texture coordinates agree.
+    """
+    normal = area_vectors(vertex[face])
+    unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    smooth = np.empty((face.size, 3))
+    order = np.argsort(face.ravel(), kind="stable")
+    for corners in np.split(order, np.flatnonzero(np.diff(face.ravel()[order])) + 1):
+        triangles = corners // 3
+        alike = unit[triangles] @ unit[triangles].T > CREASE_COSINE
+        smooth[corners] = alike @ normal[triangles]
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-30)
+    rows = np.concatenate([vertex[face.ravel()], smooth, uv.reshape(-1, 2)], axis=1)
+    _, first, packed = np.unique(np.round(rows, 6), axis=0, return_index=True, return_inverse=True)
+    kept = rows[first]
+    return Mesh(kept[:, :3], kept[:, 3:6], kept[:, 6:], packed.reshape(-1, 3))
+
+
+def bake_texture(
+    vertex: Vertices, face: Faces, surface: ScannedSurface, side: int
+) -> tuple[Mesh, Rgb]:
+    """The mesh with texture coordinates of its own, and its texture, `side` x `side`.
+
+    Raises: BadObject when the surface is too rugged.
+    """
+    chart, flat = _unfold(vertex, face)
+    uv_px = pack_charts(chart, flat, side)
+    texel, point = _covered_texels(vertex[face], uv_px)
+    _, nearest = cKDTree(surface.point).query(point)
+    picture = np.zeros((side, side, 3), np.uint8)
+    picture[texel[:, 1], texel[:, 0]] = surface.rgb[nearest]
+    blank = np.ones((side, side), bool)
+    blank[texel[:, 1], texel[:, 0]] = False
+    rows, cols = distance_transform_edt(blank, return_distances=False, return_indices=True)
+    return creased_mesh(vertex, face, uv_px / side), picture[rows, cols]
+
+
+def _unfold(vertex: Vertices, face: Faces) -> tuple[Int[np.ndarray, " f"], CornerPoints]:
+    """Each triangle's chart, and its corners projected onto the chart's plane, metres.
+
+    A chart is a connected group of triangles that face the same way along an axis.
+    """
+    import trimesh
+
+    pairs = trimesh.Trimesh(vertex, face, process=False).face_adjacency
+    normal = area_vectors(vertex[face])
+    for _ in range(3):
+        spread = 3 * normal
+        np.add.at(spread, pairs, normal[pairs[:, ::-1]])
+        normal = spread
+    axis = np.abs(normal).argmax(axis=1)
+    direction = 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] > 0)
+    alike = pairs[direction[pairs[:, 0]] == direction[pairs[:, 1]]]
+    chart = trimesh.graph.connected_component_labels(alike, node_count=len(face))
+    plane = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    axes = plane[:, None, :].repeat(3, axis=1)
+    return chart.astype(np.int64), np.take_along_axis(vertex[face], axes, 2)
+
+
+def pack_charts(chart: Int[np.ndarray, " f"], flat: CornerPoints, side: int) -> CornerPoints:
+    """Charts side by side on shelves, as large as fits the square, a gutter around each; pixels.
+
+    Raises: BadObject when there are more of them than fit at any size.
+    """
+    count = int(chart.max()) + 1
+    most = (side // (2 * GUTTER_PX + 1)) ** 2
+    if count > most:
+        raise BadObject(
+            f"objects: the surface falls into {count:,} pieces that face apart, and a texture "
+            f"holds {most:,}; smooth or remesh it in your 3-D tool."
+        )
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, chart, flat.min(axis=1))
+    np.maximum.at(high, chart, flat.max(axis=1))
+    scale = side / float(np.sqrt(np.prod(high - low, axis=1).sum()))
+    while True:
+        size = np.ceil((high - low) * scale).astype(int) + 2 * GUTTER_PX
+        corner, x, y, tall = np.zeros_like(size), 0, 0, 0
+        for i in np.argsort(-size[:, 1], kind="stable"):
+            width, height = map(int, size[i])
+            if x + width > side:
+                x, y, tall = 0, y + tall, 0
+            corner[i] = x, y
+            x, tall = x + width, max(tall, height)
+        if y + tall <= side and size.max() <= side:
+            return (flat - low[chart][:, None]) * scale + corner[chart][:, None] + GUTTER_PX
+        scale *= 0.96
+
+
+def _covered_texels(
+    corner: Float[np.ndarray, "f 3 3"], uv_px: CornerPoints
+) -> tuple[Int[np.ndarray, "t 2"], Float[np.ndarray, "t 3"]]:
+    """Every texel (x, y) whose centre lies in a triangle, and the point of the surface there."""
+    texels, points = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3))]
+    for triangle, flat in zip(corner, uv_px, strict=True):
+        across = np.array([flat[1] - flat[0], flat[2] - flat[0]]).T
+        if abs(np.linalg.det(across)) < 1e-6:
+            continue
+        low, high = flat.min(axis=0).astype(int), flat.max(axis=0).astype(int) + 1
+        grid = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        texel = np.stack(grid, axis=-1).reshape(-1, 2)
+        share = (texel + 0.5 - flat[0]) @ np.linalg.inv(across).T
+        inside = (share >= -1e-6).all(axis=1) & (share.sum(axis=1) <= 1 + 1e-6)
+        texels.append(texel[inside])
+        points.append(triangle[0] + share[inside] @ (triangle[1:] - triangle[0]))
+    return np.concatenate(texels), np.concatenate(points)

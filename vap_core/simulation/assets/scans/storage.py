@@ -15,6 +15,7 @@ from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -97,7 +98,7 @@ def target_folder(folder: Path, name: str, replace: bool) -> Path:
     """Where a scan of that name goes. Raises: BadOutput if it exists and `replace` is off."""
     target = folder / name
     if not replace and (target.exists() or _former(target).exists()):
-        raise _exists(target)
+        raise BadOutput(f"objects: {target} exists; choose another --name or pass --replace.")
     return target
 
 
@@ -111,10 +112,6 @@ def _name_of(folder: Path) -> str:
     if folder.name.startswith("."):
         return folder.name.removeprefix(".").removesuffix(FORMER)
     return folder.name
-
-
-def _exists(target: Path) -> BadOutput:
-    return BadOutput(f"objects: {target} exists; choose another --name or pass --replace.")
 
 
 def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool = False) -> Path:
@@ -131,8 +128,7 @@ def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool
     try:
         _write_folder(target, files, replace)
     except OSError as error:
-        if target.exists() and not replace:
-            raise _exists(target) from error
+        target_folder(folder, metadata.name, replace)
         raise BadOutput(
             f"objects: {folder} cannot be written ({error.strerror}); choose another folder with "
             "--out."
@@ -142,20 +138,19 @@ def save_scan(folder: Path, metadata: ScanMetadata, scan: Scan, *, replace: bool
 
 def _encode_scan(scan: Scan) -> dict[str, bytes]:
     """The contents of `FILES`."""
-    form = scan.form
-    hull_arrays: dict[str, np.ndarray] = {}
+    hulls: dict[str, np.ndarray] = {}
     for i, hull in enumerate(scan.hulls):
-        hull_arrays[f"{i:02d}.vertex"] = np.asarray(hull.vertex)
-        hull_arrays[f"{i:02d}.volume"] = np.asarray(hull.volume)
+        hulls[f"{i:02d}.vertex"] = hull.vertex
+        hulls[f"{i:02d}.volume"] = np.asarray(hull.volume)
+    mesh = {name: getattr(scan.form, name) for name in ("vertex", "normal", "uv", "face")}
+    files = {}
+    for file, arrays in ((MESH_FILE, mesh), (HULLS_FILE, hulls)):
+        packed = io.BytesIO()
+        np.savez_compressed(packed, allow_pickle=False, **arrays)
+        files[file] = packed.getvalue()
     picture = io.BytesIO()
     Image.fromarray(scan.image).save(picture, "PNG")
-    return {
-        MESH_FILE: _encode_arrays(
-            {"vertex": form.vertex, "normal": form.normal, "uv": form.uv, "face": form.face}
-        ),
-        HULLS_FILE: _encode_arrays(hull_arrays),
-        TEXTURE_FILE: picture.getvalue(),
-    }
+    return {**files, TEXTURE_FILE: picture.getvalue()}
 
 
 def _write_folder(target: Path, files: Mapping[str, bytes], replace: bool) -> None:
@@ -196,63 +191,48 @@ def load_scan(folder: Path) -> tuple[ScanMetadata, Scan]:
 def _load_version(folder: Path, written_ns: int) -> tuple[ScanMetadata, Scan]:
     """The scan as it was written at that time."""
     metadata, digests = _read_metadata(folder)
-    contents = {}
-    for name in FILES:
-        contents[name] = _read_checked(folder / name, digests.get(name))
-    form = _parse(folder / MESH_FILE, contents[MESH_FILE], _decode_mesh)
-    hulls = _parse(folder / HULLS_FILE, contents[HULLS_FILE], _decode_hulls)
-    image = _parse(folder / TEXTURE_FILE, contents[TEXTURE_FILE], _decode_picture)
-    return metadata, Scan(form=form, hulls=hulls, image=image)
-
-
-def _read_checked(path: Path, digest: str | None) -> bytes:
-    """The file's contents. Raises: BadObject when they do not have that SHA-256."""
-    data = b""
-    if path.is_file():
-        data = path.read_bytes()
-    if sha256(data).hexdigest() == digest:
-        return data
-    flaw = "missing or empty"
-    if data:
-        flaw = "damaged (its SHA-256 differs)"
-    raise BadObject(f"objects: {path} is {flaw}; {REMEDY}.")
-
-
-def _parse[T](path: Path, data: bytes, decode: Callable[[bytes], T]) -> T:
-    try:
-        return decode(data)
-    except Exception as error:  # a damaged file makes the decoders raise anything
-        raise BadObject(
-            f"objects: {path} lacks what an object needs ({error}); {REMEDY}."
-        ) from error
+    parts = []
+    for name, decode in DECODERS.items():
+        path = folder / name
+        data = path.read_bytes() if path.is_file() else b""
+        if sha256(data).hexdigest() != digests.get(name):
+            flaw = "damaged (its SHA-256 differs)" if data else "missing or empty"
+            raise BadObject(f"objects: {path} is {flaw}; {REMEDY}.")
+        try:
+            parts.append(decode(data))
+        except Exception as error:  # a damaged file makes the decoders raise anything
+            raise BadObject(
+                f"objects: {path} lacks what an object needs ({error}); {REMEDY}."
+            ) from error
+    return metadata, Scan(*parts)
 
 
 def _decode_mesh(data: bytes) -> Mesh:
-    arrays = _decode_arrays(data)
-    mesh = Mesh(
-        vertex=arrays["vertex"], normal=arrays["normal"], uv=arrays["uv"], face=arrays["face"]
-    )
-    count = len(mesh.vertex)
-    if not count == len(mesh.normal) == len(mesh.uv) or not (
-        0 <= mesh.face.min() <= mesh.face.max() < count
-    ):
+    mesh = Mesh(**_decode_arrays(data))
+    known = min(map(len, (mesh.vertex, mesh.normal, mesh.uv)))
+    if not 0 <= mesh.face.min() <= mesh.face.max() < known:
         raise ValueError("faces name vertices that are not there")
     return mesh
 
 
 def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
     arrays = _decode_arrays(data)
-    hulls = []
-    for i in range(len(arrays) // 2):
-        hulls.append(Hull(arrays[f"{i:02d}.vertex"], float(arrays[f"{i:02d}.volume"])))
-    if not hulls:
+    if not arrays:
         raise ValueError("no hulls")
-    return tuple(hulls)
+    names = (f"{i:02d}" for i in range(len(arrays) // 2))
+    return tuple(Hull(arrays[f"{n}.vertex"], float(arrays[f"{n}.volume"])) for n in names)
 
 
 def _decode_picture(data: bytes) -> Rgb:
     with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
         return np.array(picture.convert("RGB"))
+
+
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    MESH_FILE: _decode_mesh,
+    HULLS_FILE: _decode_hulls,
+    TEXTURE_FILE: _decode_picture,
+}
 
 
 def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
@@ -264,24 +244,13 @@ def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
             raise BadObject(
                 f"objects: {path} is of another version than {FORMAT} {VERSION}; {REMEDY}."
             )
-        digests = about.pop("sha256")
+        digests = dict(about.pop("sha256"))
         metadata = ScanMetadata(**about)
-        if (
-            metadata.name != _name_of(folder)
-            or not np.isfinite(metadata.mass_kg)
-            or metadata.mass_kg <= 0
-            or not isinstance(digests, dict)
-        ):
+        if metadata.name != _name_of(folder) or not 0 < metadata.mass_kg < np.inf:
             raise ValueError(f"name {metadata.name!r}, mass {metadata.mass_kg} kg")
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise BadObject(f"objects: {path} is damaged ({error}); {REMEDY}.") from error
     return metadata, digests
-
-
-def _encode_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    return file.getvalue()
 
 
 def _decode_arrays(data: bytes) -> dict[str, np.ndarray]:
