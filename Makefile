@@ -4,6 +4,8 @@
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
 RUN := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 .venv/bin/python
 QUIET_LAB := --LabApp.news_url=None --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate --LabApp.extension_manager=readonly
+# The repository is served, so that the notebooks' pictures and links are found; the tour opens.
+WHOLE := --ServerApp.root_dir=. --LabApp.default_url=/lab/tree/notebooks/00_tour.ipynb
 # JupyterLab asks for this where root runs it, as in a container.
 AS_ROOT := $(if $(filter 0,$(shell id -u)),--allow-root)
 # Three workers for two cores: some tests wait for processes that they have started.
@@ -61,7 +63,7 @@ audit: setup
 	@bash .ci/audit
 
 lab: setup
-	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) notebooks $(AS_ROOT)
+	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) $(WHOLE) $(AS_ROOT)
 
 html: setup
 	@$(RUN) -m vap_core.analysis.notebook_pages

@@ -1,6 +1,8 @@
 """JupyterLab in a real Chromium: the tour is run, its viewer draws, and a control answers."""
 
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -32,11 +34,11 @@ def lab(tmp_path: Path) -> Iterator[str]:
     shutil.copy(ROOT / "notebooks" / "00_tour.ipynb", tmp_path / "notebooks")
     shutil.copytree(ROOT / "figures", tmp_path / "figures")
     makefile = (ROOT / "Makefile").read_text()
-    quiet = next(line for line in makefile.splitlines() if line.startswith("QUIET_LAB := "))
+    options = re.findall(r"^(?:QUIET_LAB|WHOLE) := (.*)$", makefile, re.MULTILINE)
     port = free_port()
     command = [sys.executable, "-m", "jupyter", "lab", "--ip", "127.0.0.1", f"--port={port}"]
-    command += [word for word in quiet.split(" := ")[1].split() if word.startswith("--LabApp")]
-    command += ["--no-browser", "--allow-root", "--IdentityProvider.token=", "notebooks"]
+    command += shlex.split(" ".join(options))
+    command += ["--no-browser", "--allow-root", "--IdentityProvider.token="]
     command += ["--LabApp.expose_app_in_browser=True"]
     environment = {
         **os.environ,
@@ -90,7 +92,7 @@ def n_colours(picture: np.ndarray) -> int:
 def test_the_tour_runs_its_viewer_draws_and_a_control_answers(lab: str, tmp_path: Path) -> None:
     with browser.browser(tmp_path) as page:
         page.wait(lambda: answers(lab), "JupyterLab", 60)
-        page.open(f"{lab}/lab/tree/00_tour.ipynb")
+        page.open(f"{lab}/lab/tree/notebooks/00_tour.ipynb")
         page.wait(lambda: page.find(".jp-Notebook .jp-Cell"), "the notebook", 120)
         page.wait(
             lambda: (

@@ -2,17 +2,25 @@
 
 import base64
 import json
+import os
 import re
+import shlex
 import shutil
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
 from vap_core.analysis import notebook_links, notebook_pages
 from vap_core.base.errors import BadOutput
+from vap_core.recording.show import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
@@ -62,6 +70,46 @@ def test_every_link_of_a_notebook_leads_somewhere(path: Path) -> None:
             target = (NOTEBOOKS / name).resolve() if name else path
             assert target.exists(), link
             assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.slow
+def test_make_lab_serves_every_picture_and_link_of_a_notebook(tmp_path: Path) -> None:
+    """It served notebooks/ alone: the tour's first picture and 15 links were 404."""
+    makefile = (ROOT / "Makefile").read_text()
+    options = re.findall(r"^(?:QUIET_LAB|WHOLE) := (.*)$", makefile, re.MULTILINE)
+    address = f"http://127.0.0.1:{(port := free_port())}"
+    command = [sys.executable, "-m", "jupyter", "lab", "--ip", "127.0.0.1", f"--port={port}"]
+    command += [*shlex.split(" ".join(options)), "--no-browser", "--allow-root"]
+    command += ["--IdentityProvider.token=secret"]
+    asking = {"headers": {"Authorization": "token secret"}, "timeout": 30}
+    environment = {**os.environ, "HOME": str(tmp_path)}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, cwd=ROOT, env=environment, **quiet) as process:
+        try:
+            deadline = time.monotonic() + 120
+            while time.monotonic() < deadline:
+                with suppress(httpx.HTTPError):
+                    if httpx.get(f"{address}/api/status", **asking).status_code == 200:
+                        break
+                time.sleep(0.5)
+            first = httpx.get(f"{address}/", follow_redirects=True, **asking)
+            assert first.url.path == "/lab/tree/notebooks/00_tour.ipynb"
+            asked = 0
+            for path in FILES:
+                for text in markdown(path).values():
+                    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+                        name = link.partition("#")[0]
+                        if name and not link.startswith(("http", "attachment:")):
+                            inside = (NOTEBOOKS / name).resolve().relative_to(ROOT).as_posix()
+                            # Lab opens folders and notebooks by its own interface.
+                            opened = (ROOT / inside).is_dir() or inside.endswith(".ipynb")
+                            at = f"api/contents/{inside}?content=0" if opened else f"files/{inside}"
+                            answer = httpx.get(f"{address}/{at}", **asking)
+                            assert answer.status_code == 200, (path.name, link)
+                            asked += 1
+            assert asked > 50
+        finally:
+            process.terminate()
 
 
 def test_the_map_holds_every_notebook() -> None:
