@@ -251,6 +251,18 @@ def test_ground_refuses_what_it_cannot_match(
     assert "known: embedded" in refused(
         "ground", image, "bring my cup", "--stack", "psychic", *common
     )
+    beyond = refused(
+        "ground",
+        image,
+        "bring my cup",
+        "--box",
+        "10,10,961,40",
+        "--memory",
+        bank,
+        "--out",
+        tmp_path,
+    )
+    assert "'10,10,961,40' is no box inside the picture, which has 960x320 pixels" in beyond
 
 
 def test_ground_refuses_a_damaged_memory(

@@ -61,9 +61,9 @@ def shared_targets(attended: Attended) -> tuple[str, ...]:
 
 
 def parse_boxes(boxes: Sequence[str], rgb: Rgb) -> Boxes:
-    """Candidates given by hand as "x0,y0,x1,y1" in pixels, clipped to the picture.
+    """Candidates given by hand as "x0,y0,x1,y1" in pixels.
 
-    Raises: BadInstruction for a text without four numbers, or without area inside the picture.
+    Raises: BadInstruction for a text without four numbers, or that are no box inside the picture.
     """
     height, width = rgb.shape[:2]
     rows = [_parse_box(text, width, height) for text in boxes]
@@ -180,20 +180,20 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
 
 
 def _parse_box(text: str, width: int, height: int) -> list[float]:
-    """One box "x0,y0,x1,y1", clipped to a picture of `width` x `height` pixels."""
+    """One box "x0,y0,x1,y1", inside a picture of `width` x `height` pixels."""
     try:
         x0, y0, x1, y1 = map(float, text.split(","))
     except ValueError as error:
         raise BadInstruction(
             f"--box {text!r} is not x0,y0,x1,y1; for example --box 40,60,180,220."
         ) from error
-    box = [max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))]
-    if not (box[2] - box[0] >= 1 and box[3] - box[1] >= 1):
+    inside = x0 >= 0 and y0 >= 0 and x1 <= width and y1 <= height
+    if not (inside and x1 - x0 >= 1 and y1 - y0 >= 1):
         raise BadInstruction(
-            f"--box {text!r} has no area inside the {width}x{height} picture; "
-            "x to the right, y down, far corner last."
+            f"--box {text!r} is no box inside the picture, which has {width}x{height} pixels when "
+            "upright; x to the right, y down, far corner last."
         )
-    return box
+    return [x0, y0, x1, y1]
 
 
 def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:

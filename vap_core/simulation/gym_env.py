@@ -22,7 +22,7 @@ from vap_core.base.errors import BadSuite, one_of
 from vap_core.base.types import Rgb
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import Scene, meshes_called
-from vap_core.simulation.suites import Judge
+from vap_core.simulation.suites import Judge, shared
 from vap_core.simulation.suites.lists import check
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
 from vap_core.simulation.suites.suite import Suite
@@ -223,6 +223,8 @@ def env_id(suite: str, task: str) -> str:
 def register() -> None:
     """Enter every task of every suite that is not entered yet, the user's own among them.
 
+    Tasks in several steps are none: the reward here is of one goal (`VapEnv._start`).
+
     Those are the suites that are open, and those of VAP_SUITES. Gymnasium's grammar of ids knows
     one slash. It is widened for namespaces under "vap/"; every other id is read as before.
 
@@ -231,7 +233,8 @@ def register() -> None:
     registration.ENV_ID_RE = re.compile(
         r"^(?:(?P<namespace>vap/[\w-]+|[\w:-]+)\/)?(?:(?P<name>[\w:.-]+?))(?:-v(?P<version>\d+))?$"
     )
-    _register(suites.SUITES.values())
+    several = {name for name, tasks in shared.TASKS.items() if any(t.subgoals for t in tasks)}
+    _register(suite for suite in suites.SUITES.values() if suite.name not in several)
     _register(suites.own_suites())
 
 
