@@ -5,10 +5,25 @@ import resource
 import shlex
 import signal
 import threading
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+
+
+def printable(text: str, kept: str = "\n\t") -> str:
+    """Text for a terminal: control characters as their escapes, but for those of `kept`.
+
+    Text from files and messages may hold a terminal's commands, or turn its direction.
+    """
+    shown = [
+        c
+        if c.isprintable() or c in kept or unicodedata.category(c) == "Zs"
+        else c.encode("unicode_escape").decode()
+        for c in text
+    ]
+    return "".join(shown)
 
 
 def first_line(error: BaseException | str) -> str:

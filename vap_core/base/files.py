@@ -7,8 +7,8 @@ import csv
 import errno
 import fcntl
 import hashlib
+import html
 import inspect
-import io
 import json
 import os
 import shutil
@@ -16,7 +16,7 @@ import stat
 import struct
 import subprocess
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -25,7 +25,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from vap_core.base.errors import BadOutput, BadStudy, VapError, first_line
+from vap_core.base.errors import BadOutput, BadStudy, VapError, first_line, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -258,16 +258,6 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_rows(path: Path, rows: Iterable[Sequence[object]]) -> None:
-    """Write rows, the columns' names first; a cell with a comma or a quote is quoted.
-
-    Raises: OSError.
-    """
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    write_atomic(path, text.getvalue().encode())
-
-
 def read_rows(
     path: Path,
     columns: Sequence[str],
@@ -348,11 +338,21 @@ def align(rows: Rows) -> str:
 
 
 def markdown(rows: Rows) -> str:
-    """A pipe table that is aligned as plain text, too."""
-    safe = []
-    for row in rows:
-        safe.append([cell.replace("|", "\\|") for cell in row])
+    """A pipe table that is aligned as plain text, too; text in it is no HTML."""
+    safe = [[html.escape(cell, quote=False).replace("|", "\\|") for cell in row] for row in rows]
     return _render(safe, "github")
+
+
+def csv_cell(cell: object) -> object:
+    """A cell of a CSV file. A spreadsheet computes text that begins as a formula does."""
+    if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return f"'{cell}"
+    return cell
+
+
+def csv_bytes(table: "pd.DataFrame") -> bytes:
+    """A table as a CSV file, without its index. Text in it is no formula."""
+    return table.map(csv_cell).to_csv(index=False).encode()
 
 
 def signed(value: float, digits: int = 0) -> str:
@@ -368,7 +368,8 @@ def signed_interval(middle: float, low: float, high: float, digits: int = 0) -> 
 def _render(rows: Rows, style: str) -> str:
     from tabulate import tabulate
 
-    text = tabulate(rows[1:], headers=rows[0], tablefmt=style, disable_numparse=True)
+    safe = [[printable(cell, "") for cell in row] for row in rows]
+    text = tabulate(safe[1:], headers=safe[0], tablefmt=style, disable_numparse=True)
     return "\n".join(line.rstrip() for line in text.splitlines())
 
 

@@ -7,10 +7,11 @@ correct is one line, with status 2.
 import inspect
 import os
 import sys
+from typing import Any
 
 import typer
 
-from vap_core.base.errors import VapError, missing_part
+from vap_core.base.errors import VapError, missing_part, printable
 from vap_core.cli import bench, look, machine, measure, own, run
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
@@ -49,13 +50,33 @@ def keep_examples(app: typer.Typer) -> None:
 keep_examples(app)
 
 
+class Terminal:
+    """A stream whose text is `printable`; `kept` are the control characters that pass.
+
+    The bars of tqdm move by two: a carriage return, and one line up.
+    """
+
+    def __init__(self, stream: Any, kept: str = "\n\t") -> None:
+        self._stream = stream
+        self._kept = kept
+
+    def write(self, text: str) -> int:
+        """Write the text; the number of its characters."""
+        self._stream.write("\x1b[A".join(printable(p, self._kept) for p in text.split("\x1b[A")))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 def main() -> None:
     """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    sys.stdout, sys.stderr = Terminal(sys.stdout), Terminal(sys.stderr, "\n\t\r")
     try:
         app()
     except VapError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error), '')}", file=sys.stderr)
         sys.exit(2)
     except ModuleNotFoundError as error:
         part = missing_part(error)

@@ -1,0 +1,90 @@
+"""Text from files is escaped where it leaves: terminal, Markdown, CSV."""
+
+from io import StringIO
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tqdm import tqdm
+
+from tests.command import refused, vap
+from vap_core.base.errors import printable
+from vap_core.base.files import align, csv_bytes, csv_cell, markdown
+from vap_core.cli import Terminal
+
+RESULTS = Path(__file__).resolve().parents[1] / "data" / "results"
+ESCAPES = (
+    "\x1b[2J",
+    "\x1b]0;title\x07",
+    "\x9b31m",
+    "\x08\x08",
+    "\u202egnp.exe",
+    "a\x00b",
+    "one\rtwo",
+)
+
+
+@given(st.text())
+def test_what_is_printed_holds_no_control_characters(text: str) -> None:
+    shown = printable(text, "")
+    assert not [c for c in shown if ord(c) < 32 or 0x7F <= ord(c) < 0xA0]
+    if text.isprintable():
+        assert shown == text
+
+
+@pytest.mark.parametrize("text", ESCAPES)
+def test_a_terminal_gets_no_commands_of_a_file(text: str) -> None:
+    for stream in (Terminal(StringIO()), Terminal(StringIO(), "\n\t")):
+        stream.write(f"before {text} after\n")
+        shown = stream.getvalue()
+        assert shown == f"before {printable(text)} after\n"
+        assert not set(shown) & set("\x1b\x07\x9b\x08\u202e\x00\r")
+    for rows in (align([["name"], [text]]), markdown([["name"], [text]])):
+        assert printable(text, "") in rows
+
+
+def test_the_bars_of_long_work_still_move() -> None:
+    out = Terminal(StringIO(), "\n\t\r")
+    for _ in tqdm(range(3), file=out, leave=False, desc="outer"):
+        for _ in tqdm(range(2), file=out, position=1, desc="inner"):
+            pass
+    assert "\r" in out.getvalue()
+    assert "\x1b[A" in out.getvalue()
+    assert "\\x1b" not in out.getvalue()
+
+
+def test_text_in_a_table_of_markdown_is_no_html() -> None:
+    table = markdown([["a|b"], ["<img src=x onerror=alert(1)> & <b>"]])
+    assert "<img" not in table
+    assert "&lt;img src=x onerror=alert(1)&gt; &amp; &lt;b&gt;" in table
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-2", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")']
+)
+def test_text_in_a_csv_file_is_no_formula(text: str) -> None:
+    assert csv_cell(text) == f"'{text}"
+    written = csv_bytes(pd.DataFrame({"text": [text], "number": [-2.5]})).decode()
+    assert written.splitlines()[0] == "text,number"
+    assert written.split("\n", 1)[1].lstrip('"').startswith("'")
+    assert written.rstrip().endswith("-2.5")
+
+
+def test_commands_print_a_strangers_text_escaped(tmp_path: Path) -> None:
+    table = pd.read_parquet(RESULTS / "mini_pi0.parquet")
+    failed = table[table["case_sentence"].notna()].head(3).copy()
+    failed["case_sentence"] = "\x1b[2J\x1b]0;mine\x07 <script>"
+    import pyarrow.parquet as pq
+
+    notes = pq.read_schema(RESULTS / "mini_pi0.parquet").metadata
+    import pyarrow as pa
+
+    whole = pa.Table.from_pandas(failed, preserve_index=False).replace_schema_metadata(notes)
+    pq.write_table(whole, tmp_path / "strange.parquet")
+    done = vap("diagnose", tmp_path / "strange.parquet")
+    assert "\x1b" not in done.stdout + done.stderr
+    assert "\\x1b[2J" in done.stdout + done.stderr
+    line = refused("diagnose", tmp_path / "strange.parquet", "--method", "\x1b[2Jvap")
+    assert "\x1b" not in line
