@@ -269,7 +269,7 @@ def test_a_task_of_a_name_that_is_there_is_refused(file: Path) -> None:
         (("y0=-0.15", 'y0="a"'), "y0 is 'a'; it must be a float."),
         (
             ('("front",)', '["front"]'),
-            "cameras is ['front']; it must be a tuple, in round brackets, as in ('front',).",
+            "cameras is ['front']; it must be a tuple, in round brackets.",
         ),
         (("(PICK,)", "[PICK]"), "...; it must be a tuple, in round brackets."),
         (

@@ -5,41 +5,49 @@ Errors name row and field.
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
+from itertools import combinations
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
+
+from jaxtyping import TypeCheckError
 
 from vap_core.base.errors import BadSuite
 from vap_core.base.files import DATA, parse_json, read_file, write_atomic
 from vap_core.simulation import robots
-from vap_core.simulation.suites.shared_fields import BadField, from_json, to_json
 from vap_core.simulation.suites.suite import Suite
 from vap_core.simulation.suites.variants import VARIANTS
-from vap_core.simulation.types import EpisodeRow, Placement, SuccessRule
+from vap_core.simulation.types import EpisodeRow, Owned, Placement, SubGoal
 
 FOLDER = DATA / "suites"
 CLOSE_M = 0.02
 """Objects keep at least this far apart."""
-FAR = 1e6
-"""Every number of a placement is smaller; nan and inf are not."""
-_TEXT = ("suite", "task", "instruction", "category", "rule", "goal", "split", "variant")
-_COUNT = ("episode", "seed", "max_steps")
-_FIELDS = {*_TEXT, *_COUNT, "placements", "cameras"}
-_SHARED = {"speaker", "owned", "subgoals"}
-"""Fields of a shared scene's rows; the others have none of them."""
+FAR_M = 2.0
+"""Objects stand within so much of the robot."""
+FIELDS = (
+    "suite", "task", "instruction", "category", "rule", "goal", "split", "variant", "episode",
+    "seed", "max_steps", "cameras", "placements",
+)  # fmt: skip
+SHARED_FIELDS = ("speaker", "owned", "subgoals")
+"""Of rows of shared scenes alone."""
+WRONG_TYPE = re.compile(
+    r"parameter '(?P<name>\w+)'\.\s*Actual value: (?P<found>.*?)\s*"
+    r"Expected type: (?P<wanted>.*?)\.\s*(?:----|$)",
+    re.DOTALL,
+)
+"""What jaxtyping says of a field whose value has another type than its annotation."""
 
 
 def write(name: str, rows: Sequence[EpisodeRow], folder: Path = FOLDER) -> str:
     """Write a suite's list and enter it in the manifest; returns the file's sha256."""
     folder.mkdir(parents=True, exist_ok=True)
-    lines = []
-    for row in rows:
-        lines.append(to_line(row))
-    data = "".join(lines).encode()
+    data = "".join(map(to_line, rows)).encode()
     digest = hashlib.sha256(data).hexdigest()
     write_atomic(folder / f"{name}.jsonl", data)
-    manifest = _manifest(folder, missing_is_empty=True)
+    manifest = _manifest(folder) if (folder / "manifest.json").exists() else {}
     manifest[name] = {"sha256": digest, "episodes": len(rows)}
     text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
     write_atomic(folder / "manifest.json", text.encode())
@@ -68,11 +76,9 @@ def read(name: str, folder: Path = FOLDER) -> tuple[EpisodeRow, ...]:
             f"suites: {path} changed since its hash {wanted[:12]} was taken; "
             "restore it (git checkout), or enter it anew with suites.lists.write."
         )
-    rows = []
-    numbers: dict[str, int] = {}
     lines = data.decode(errors="replace").splitlines()
-    for i, line in enumerate(lines, 1):
-        rows.append(_parse_row(line, f"{path.name} row {i}"))
+    rows = [_parse_row(line, f"{path.name} row {i}") for i, line in enumerate(lines, 1)]
+    numbers: dict[str, int] = {}
     for i, row in enumerate(rows, 1):
         if row.suite != name:
             raise BadSuite(
@@ -102,8 +108,7 @@ def check(rows: Iterable[EpisodeRow], suite: Suite) -> None:
     """Refuse rows that could not be run. Raises: BadSuite, naming row and field."""
     n_joints = len(robots.get(suite.robot).joints)
     for i, row in enumerate(rows, 1):
-        text = json.dumps(_to_json(row))
-        _parse_row(text, f"row {i}")
+        _check(row, f"row {i}")
         start = row.start
         for field, n, most in (
             ("start.offsets", len(start.offsets), len(row.placements)),
@@ -121,37 +126,24 @@ def check(rows: Iterable[EpisodeRow], suite: Suite) -> None:
 
 def to_line(row: EpisodeRow) -> str:
     """A row as a line of a list."""
-    return json.dumps(_to_json(row), separators=(",", ":")) + "\n"
+    fields = {name: getattr(row, name) for name in FIELDS}
+    fields["placements"] = [[place.model, place.x, place.y, place.yaw] for place in row.placements]
+    if row.speaker or row.owned or row.subgoals:
+        owned = [[each.model, each.owner, each.known_as] for each in row.owned]
+        subgoals = [asdict(each) for each in row.subgoals]
+        fields |= {"speaker": row.speaker, "owned": owned, "subgoals": subgoals}
+    return json.dumps(fields, separators=(",", ":")) + "\n"
 
 
-def _manifest(folder: Path, missing_is_empty: bool = False) -> dict[str, Any]:
+def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / "manifest.json"
-    if missing_is_empty and not path.exists():
-        return {}
     try:
-        manifest = parse_json(read_file(path))
-    except (OSError, ValueError) as error:
+        return dict(parse_json(read_file(path)))
+    except (OSError, ValueError, TypeError) as error:
         raise BadSuite(
             f"suites: {path} cannot be read; "
             "restore it, or run notebooks/01_benchmark_building.ipynb."
         ) from error
-    if not isinstance(manifest, dict):
-        raise BadSuite(
-            f"suites: {path} holds no table of hashes; "
-            "restore it, or run notebooks/01_benchmark_building.ipynb."
-        )
-    return manifest
-
-
-def _to_json(row: EpisodeRow) -> dict[str, Any]:
-    fields: dict[str, Any] = {}
-    for name in (*_TEXT, *_COUNT):
-        fields[name] = getattr(row, name)
-    fields["cameras"] = list(row.cameras)
-    fields["placements"] = []
-    for place in row.placements:
-        fields["placements"].append([place.model, place.x, place.y, place.yaw])
-    return {**fields, **to_json(row)}
 
 
 def _parse_row(line: str, where: str) -> EpisodeRow:
@@ -160,90 +152,101 @@ def _parse_row(line: str, where: str) -> EpisodeRow:
         fields = parse_json(line)
     except ValueError as error:
         raise BadSuite(f"suites: {where} is not JSON ({error}).") from error
-    try:
-        _check_fields(fields)
-        _check_placements(fields["placements"])
-        _check_goal(fields)
-        shared = from_json(fields)
-    except BadField as error:
-        raise BadSuite(f"suites: {where}, field {error.field!r}: {error.reason}.") from None
-    placements = []
-    for model, x, y, yaw in fields["placements"]:
-        placements.append(Placement(model=model, x=float(x), y=float(y), yaw=float(yaw)))
-    fields["placements"] = tuple(placements)
-    fields["cameras"] = tuple(fields["cameras"])
-    return EpisodeRow(**{**fields, **shared})
-
-
-def _check_fields(fields: Any) -> None:
-    """The names of the fields, and the values of all but the placements and the goal."""
-    expected = ", ".join(sorted(_FIELDS))
-    if not isinstance(fields, Mapping):
-        raise BadField("everything", f"missing or unknown; a row has {expected}")
-    if set(fields) - _SHARED != _FIELDS:
-        odd = sorted(_FIELDS ^ (set(fields) - _SHARED))
-        raise BadField(odd[0], f"missing or unknown; a row has {expected}")
-    for name in _TEXT:
-        if not isinstance(fields[name], str):
-            raise BadField(name, f"{fields[name]!r} is no text")
-    for name in _COUNT:
-        least = 1 if name == "max_steps" else 0
-        if type(fields[name]) is not int or fields[name] < least:
-            kind = "positive whole number" if least else "whole number"
-            raise BadField(name, f"{fields[name]!r} is no {kind}")
-    rules = get_args(SuccessRule)
-    if fields["rule"] not in rules:
-        raise BadField("rule", f"{fields['rule']!r} is unknown; known: {', '.join(rules)}")
-    if fields["variant"] not in VARIANTS:
-        known = ", ".join(VARIANTS)
-        raise BadField("variant", f"{fields['variant']!r} is unknown; known: {known}")
-    cameras = fields["cameras"]
-    if not isinstance(cameras, list) or not all(isinstance(name, str) for name in cameras):
-        raise BadField("cameras", f"{cameras!r} is no list of camera names")
-
-
-def _check_placements(placements: Any) -> None:
-    if not isinstance(placements, list) or not placements:
-        raise BadField("placements", "empty; the first one is the target")
-    for i, place in enumerate(placements):
-        if not (isinstance(place, list) and len(place) == 4 and isinstance(place[0], str)):
-            raise BadField("placements", f"number {i} is {place!r}, not [model, x, y, yaw]")
-        model, x, y, yaw = place
-        if not (_is_number(x) and _is_number(y) and _is_number(yaw)):
-            raise BadField(
-                "placements",
-                f"{model!r} stands at {place[1:]}; x, y (m) and yaw (rad) must be finite numbers",
-            )
-        away_m = max(abs(x), abs(y))
-        if away_m > 2.0:
-            raise BadField(
-                "placements",
-                f"{model!r} stands {away_m:g} m away; metres, within 2 of the robot",
-            )
-        for other_model, other_x, other_y, _ in placements[:i]:
-            apart_m = max(abs(x - other_x), abs(y - other_y))
-            if model != other_model and apart_m < CLOSE_M:
-                raise BadField(
-                    "placements",
-                    f"{model!r} and {other_model!r} stand in the same place; "
-                    f"objects keep at least {CLOSE_M} m apart",
-                )
-
-
-def _is_number(number: Any) -> bool:
-    """Whether it is an int or a float, and finite."""
-    return type(number) in (int, float) and abs(number) < FAR
-
-
-def _check_goal(fields: Mapping[str, Any]) -> None:
-    names = [place[0] for place in fields["placements"]]
-    if len(set(names)) < len(names):
-        raise BadField("placements", f"an object is placed twice in {names}")
-    goal = fields["goal"]
-    needs_goal = fields["rule"] in ("near", "put")
-    if bool(goal) != needs_goal or (goal and goal not in names[1:]):
-        raise BadField(
-            "goal",
-            f"{goal!r} for rule {fields['rule']!r}; near and put name a placed object "
-            "other than the target, the others none",
+    if not isinstance(fields, dict) or {*fields} - {*SHARED_FIELDS} != {*FIELDS}:
+        odd = sorted({*FIELDS} ^ ({*fields} - {*SHARED_FIELDS})) if isinstance(fields, dict) else []
+        raise BadSuite(
+            f"suites: {where}, field {(odd or ['everything'])[0]!r}: missing or unknown; a row has "
+            f"{', '.join(sorted(FIELDS))}."
         )
+    for name, make in NESTED.items():
+        given = fields.get(name, [])
+        try:
+            if not isinstance(given, list):
+                raise TypeError(f"{given!r} is no list")
+            fields[name] = tuple(make(each) for each in given)
+        except (TypeError, ValueError) as error:
+            raise BadSuite(f"suites: {where}, field {name!r}: {said(error)}") from error
+    try:
+        row = EpisodeRow(**fields)
+    except TypeError as error:
+        raise BadSuite(f"suites: {where}: {said(error)}") from error
+    _check(row, where)
+    return row
+
+
+NESTED: Mapping[str, Callable[[Any], Any]] = {
+    "placements": lambda each: Placement(each[0], *map(float, each[1:])),
+    "cameras": lambda name: name,
+    "owned": lambda each: Owned(each[0], each[1], *map(tuple, each[2:])),
+    "subgoals": lambda each: SubGoal(**each),
+}
+"""Fields that hold lists, and what their entries become."""
+
+
+def said(error: BaseException) -> str:
+    """An error as one line: of a field of another type than its annotation, what it must be."""
+    wrong = WRONG_TYPE.search(str(error)) if isinstance(error, TypeCheckError) else None
+    if wrong is None:
+        return f"{type(error).__name__}: {' '.join(str(error).split()).removesuffix('.')}."
+    found, wanted = " ".join(wrong["found"].split()), wrong["wanted"].removeprefix("typing.")
+    if wanted.startswith("<class '"):
+        wanted = wanted[8:-2].rpartition(".")[2]
+    mend = f"it must be of type {wanted}"
+    if found.startswith("[") and wanted.startswith("tuple"):
+        mend = "it must be a tuple, in round brackets"
+    elif wanted == "float":
+        mend = "it must be a float"
+        if found.lstrip("-").isdecimal():
+            mend += f", as in {found}.0"
+    short = found if len(found) <= 60 else f"{found[:60]}..."
+    return f"{wrong['name']} is {short}; {mend}."
+
+
+def _check(row: EpisodeRow, where: str) -> None:
+    for field, reason in _faults(row):
+        raise BadSuite(f"suites: {where}, field {field!r}: {reason}.")
+
+
+def _faults(row: EpisodeRow) -> Iterator[tuple[str, str]]:
+    """The fields that will not do, and why."""
+    for name, least in (("episode", 0), ("seed", 0), ("max_steps", 1)):
+        if getattr(row, name) < least:
+            yield name, f"{getattr(row, name)} is less than {least}"
+    if row.variant not in VARIANTS:
+        yield "variant", f"{row.variant!r} is unknown; known: {', '.join(VARIANTS)}"
+    names = [place.model for place in row.placements]
+    if not names:
+        yield "placements", "empty; the first one is the target"
+    for place in row.placements:
+        away_m = max(abs(place.x), abs(place.y))
+        if not away_m <= FAR_M or not abs(place.yaw) < 1e6:
+            yield (
+                "placements",
+                f"{place.model!r} stands {away_m:g} m away, turned by {place.yaw:g}; metres, "
+                f"within {FAR_M:g} of the robot, and radians",
+            )
+    if len(set(names)) < len(names):
+        yield "placements", f"an object is placed twice in {names}"
+    for one, other in combinations(row.placements, 2):
+        if max(abs(one.x - other.x), abs(one.y - other.y)) < CLOSE_M:
+            yield (
+                "placements",
+                f"{other.model!r} and {one.model!r} stand in the same place; objects keep at least "
+                f"{CLOSE_M} m apart",
+            )
+    if bool(row.goal) != (row.rule in ("near", "put")) or row.goal not in ("", *names[1:]):
+        yield (
+            "goal",
+            f"{row.goal!r} for rule {row.rule!r}; near and put name a placed object other than the "
+            "target, the others none",
+        )
+    for each in row.owned:
+        if each.model not in names:
+            yield "owned", f"{each.model!r} is not placed"
+    for each in row.subgoals:
+        others = {*names} - {each.target}
+        goals = others if each.rule in ("near", "put") else {""}
+        if each.target not in names or each.goal not in goals or each.max_steps < 1:
+            yield "subgoals", f"{each.rule} {each.target!r} with the goal {each.goal!r} will not do"
+    if row.subgoals and row.subgoals[0].target != names[0]:
+        yield "subgoals", f"the first is about {row.subgoals[0].target!r}, not the target"

@@ -14,8 +14,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jaxtyping import TypeCheckError
-
 from vap_core.base.errors import BadSuite, VapError, one_of
 from vap_core.base.types import value
 from vap_core.simulation import robots
@@ -28,15 +26,6 @@ from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 VARIABLE = "VAP_SUITES"
 NAME = re.compile(r"[\w-]+")
-WHOLE_NUMBER = re.compile(r"-?\d+")
-WRONG_TYPE = re.compile(
-    r"parameter '(?P<name>\w+)'\.\s*Actual value: (?P<found>.*?)\s*"
-    r"Expected type: (?P<wanted>.*?)\.\s*(?:----|$)",
-    re.DOTALL,
-)
-"""What jaxtyping says of a field whose value has another type than its annotation."""
-LONGEST_VALUE = 60
-"""Characters of a field's value in an error."""
 
 
 @value
@@ -138,37 +127,12 @@ def _place(path: Path, file: Path, error: BaseException) -> str:
 
 def _said(error: BaseException) -> str:
     """An error as one line."""
-    if isinstance(error, TypeCheckError):
-        wrong = WRONG_TYPE.search(str(error))
-        if wrong is not None:
-            return _wrong_type(**wrong.groupdict())
     if isinstance(error, SystemExit):
         called = f"sys.exit({error.code!r}) was called"
         return f"{called}; let the file end by itself, with SUITE and rows()."
-    words = " ".join(str(error).split()).removesuffix(".")
-    return f"{words}." if isinstance(error, VapError) else f"{type(error).__name__}: {words}."
-
-
-def _wrong_type(name: str, found: str, wanted: str) -> str:
-    """A field of another type than its annotation, as one line."""
-    mend = f"it must be of type {wanted.removeprefix('typing.')}"
-    if wanted == "<class 'float'>":
-        mend = "it must be a float"
-        if WHOLE_NUMBER.fullmatch(found):
-            mend += f", as in {found}.0"
-    elif found.startswith("[") and wanted.startswith("tuple"):
-        mend = "it must be a tuple, in round brackets"
-        if len(found) <= LONGEST_VALUE:
-            mend += f", as in ({found[1:-1]},)"
-    elif wanted.startswith("<class '"):
-        mend = f"it must be of type {wanted[8:-2].rpartition('.')[2]}"
-    return f"{name} is {_short(found)}; {mend}."
-
-
-def _short(text: str) -> str:
-    """The text on one line, cut where it is long."""
-    line = " ".join(text.split())
-    return line if len(line) <= LONGEST_VALUE else f"{line[:LONGEST_VALUE]}..."
+    if isinstance(error, VapError):
+        return f"{' '.join(str(error).split()).removesuffix('.')}."
+    return lists.said(error)
 
 
 def _check_tasks(suite: Suite) -> None:
