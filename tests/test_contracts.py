@@ -431,6 +431,6 @@ def test_objects_classes_and_functions_can_be_named(
     Path("beside.py").write_text("PART = 7\n")
     assert given.made("lazy_load:load") == 7, "what is imported late is found, too"
     assert isinstance(given.made("vap_core.policies.scripted.scripted:Random"), Random)
-    assert given.made("vap_core.simulation.suites.pick:WIDOWX") is SUITES["widowx-pick"]
+    assert given.made("vap_core.simulation.suites.layout:WIDOWX") is SUITES["widowx-pick"]
     assert given.made("vap_core.perception.embedded.encoder:load").name.startswith("lite0")
     assert given.made("vap_core.vote:similarity") is similarity

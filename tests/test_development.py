@@ -14,7 +14,7 @@ from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import BENCHMARKS, development, lists, simpler
+from vap_core.simulation.suites import BENCHMARKS, benchmarks, development, lists
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import stats
@@ -56,7 +56,7 @@ def test_no_layout_and_no_object_of_the_list_that_is_reported_returns(name: str)
 
 def test_its_objects_are_of_the_task_and_of_no_film(name: str) -> None:
     assert TRAIN_INSTANCES < development.INSTANCE < HELD_OUT
-    assert not simpler.NOVEL <= development.INSTANCE < simpler.NOVEL + 20, "distractors"
+    assert not benchmarks.NOVEL <= development.INSTANCE < benchmarks.NOVEL + 20, "distractors"
     for task in BENCHMARKS[name].tasks:
         met = set()
         for row in suites.rows(f"{name}-dev", task.name):

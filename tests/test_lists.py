@@ -16,23 +16,15 @@ from vap_core.instruction import parse
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.grasps import points_world
-from vap_core.simulation.suites import (
-    BENCHMARKS,
-    SHARED,
-    VARIANTS,
-    lists,
-    simpler,
-    tabletop,
-    vlabench,
-)
-from vap_core.simulation.suites.variants import AGGREGATION, MATCHING
+from vap_core.simulation.suites import BENCHMARKS, SHARED, VARIANTS, benchmarks, lists
+from vap_core.simulation.suites.suite import AGGREGATION, MATCHING
 from vap_core.simulation.types import AS_LISTED
 
 BUILDERS = {
-    "simpler-fractal": simpler.fractal_rows,
-    "simpler-bridge": simpler.bridge_rows,
-    "vlabench": vlabench.rows,
-    "tabletop": tabletop.rows,
+    "simpler-fractal": benchmarks.fractal_rows,
+    "simpler-bridge": benchmarks.bridge_rows,
+    "vlabench": benchmarks.vlabench_rows,
+    "tabletop": benchmarks.tabletop_rows,
 }
 PER_TASK = {
     ("simpler-fractal", "pick-pen-holder", "visual matching"): 300,
@@ -234,7 +226,7 @@ def test_the_pick_grid_is_three_orientations_times_twenty_five_cells():
 
 
 def test_bridge_swaps_target_and_goal_over_the_corners_of_a_square():
-    side, (x, y) = 0.15, simpler.CENTRE
+    side, (x, y) = 0.15, benchmarks.CENTRE
     corners = {
         (round(x + i * side / 2, 4), round(y + j * side / 2, 4)) for i in (-1, 1) for j in (-1, 1)
     }
@@ -466,4 +458,4 @@ def test_neither_yaw_nor_place_tells_the_target():
         for row in near
     ]
     assert np.bincount(np.argsort(np.argsort(away, axis=1), axis=1)[:, 0]).tolist() == [14, 13, 13]
-    assert np.min(away) > simpler.APART_M - 1e-3
+    assert np.min(away) > benchmarks.APART_M - 1e-3

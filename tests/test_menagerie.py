@@ -8,7 +8,7 @@ import pytest
 from vap_core.base.errors import MissingMeshes
 from vap_core.simulation.gl import ensure_gl
 from vap_core.simulation.robots import ROBOTS
-from vap_core.simulation.robots.menagerie import MODELS, replace_visuals
+from vap_core.simulation.robots.mjcf import MODELS, replace_visuals
 from vap_core.simulation.scenes import build
 
 ensure_gl()

@@ -12,7 +12,7 @@ from vap_core.memory import load_bank
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.import_scan import import_scan
 from vap_core.simulation.suites import listed
-from vap_core.simulation.suites.own_object import APART_M, _disc_radii_m, with_object
+from vap_core.simulation.suites.starts import APART_M, _disc_radii_m, with_object
 from vap_core.study.report import _rows_by_key
 from vap_core.study.results import command_line
 from vap_core.study.store import read

@@ -10,7 +10,7 @@ from vap_core.simulation import scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import project
 from vap_core.simulation.env import Env
-from vap_core.simulation.sensor import DESK, PERFECT, Sensor, apply_sensor, draw_disturbance
+from vap_core.simulation.looks import PERFECT, WEBCAM, Sensor, apply_sensor, draw_disturbance
 from vap_core.simulation.types import EpisodeRow, Placement
 
 MODEL = "cup-personal"
@@ -60,10 +60,10 @@ def test_a_perfect_sensor_changes_nothing(scene):
 
 
 def test_the_same_row_gives_the_same_picture_and_another_episode_or_seed_another(scene):
-    one, again = env(scene, DESK).observe().images, env(scene, DESK).observe().images
+    one, again = env(scene, WEBCAM).observe().images, env(scene, WEBCAM).observe().images
     assert all((again[name] == rgb).all() for name, rgb in one.items())
     for other in (replace(ROW, episode=4), replace(ROW, seed=1), replace(ROW, task="select-vase")):
-        seen = env(scene, DESK, other).observe().images
+        seen = env(scene, WEBCAM, other).observe().images
         assert all((seen[name] != rgb).mean() > 0.5 for name, rgb in one.items())
 
 
@@ -78,15 +78,15 @@ def test_looking_twice_is_seeing_the_same_and_every_step_has_its_own_grain(scene
 
 
 def test_cameras_of_one_episode_stray_each_its_own_way():
-    front, side = (draw_disturbance(DESK, ROW, name) for name in ("front", "side"))
+    front, side = (draw_disturbance(WEBCAM, ROW, name) for name in ("front", "side"))
     assert not np.allclose(front.shift_m, side.shift_m)
     assert not np.allclose(front.gain, side.gain)
 
 
 def test_noise_and_gain_of_a_picture_are_the_specified_ones():
-    disturbance = draw_disturbance(DESK, ROW, "front")
-    seen = apply_sensor(DESK, GREY, disturbance, ROW, "front", 0).astype(float)
-    expected_sd = np.sqrt(DESK.noise**2 + 1 / 12)  # rounding to whole grey levels adds a twelfth
+    disturbance = draw_disturbance(WEBCAM, ROW, "front")
+    seen = apply_sensor(WEBCAM, GREY, disturbance, ROW, "front", 0).astype(float)
+    expected_sd = np.sqrt(WEBCAM.noise**2 + 1 / 12)  # rounding to whole grey levels adds a twelfth
     n = GREY[..., 0].size
     for channel in range(3):
         values = seen[..., channel]
@@ -100,10 +100,10 @@ def test_noise_and_gain_of_a_picture_are_the_specified_ones():
 
 
 def test_black_and_white_stay_within_bounds():
-    disturbance = replace(draw_disturbance(DESK, ROW, "front"), gain=np.array([1.5, 1.0, 0.5]))
+    disturbance = replace(draw_disturbance(WEBCAM, ROW, "front"), gain=np.array([1.5, 1.0, 0.5]))
     for level in (0, 255):
         seen = apply_sensor(
-            DESK, np.full((64, 64, 3), level, np.uint8), disturbance, ROW, "front", 0
+            WEBCAM, np.full((64, 64, 3), level, np.uint8), disturbance, ROW, "front", 0
         )
         assert seen.dtype == np.uint8
         assert abs(float(np.median(seen[..., 1])) - level) <= 2
@@ -111,17 +111,17 @@ def test_black_and_white_stay_within_bounds():
 
 def test_over_many_episodes_the_spreads_are_the_specified_ones():
     """A sample's standard deviation is within 4 / sqrt(2 n) of the true one, and its mean within 4 / sqrt(n) of zero."""
-    drawn = [draw_disturbance(DESK, row, "front") for row in EPISODES]
+    drawn = [draw_disturbance(WEBCAM, row, "front") for row in EPISODES]
     shift = np.array([one.shift_m for one in drawn])
     turn = np.array([Rotation.from_matrix(one.turn).as_rotvec() for one in drawn])
     gain = np.array([one.gain for one in drawn])
     n = len(EPISODES)
     for values, spread in (
-        *((shift[:, k], DESK.jitter_m) for k in range(3)),
-        *((turn[:, k], DESK.jitter_rad) for k in range(3)),
-        (np.log2(gain[:, 1]), DESK.exposure),
-        (gain[:, 0] / gain[:, 1] - 1, DESK.balance),
-        (gain[:, 2] / gain[:, 1] - 1, DESK.balance),
+        *((shift[:, k], WEBCAM.jitter_m) for k in range(3)),
+        *((turn[:, k], WEBCAM.jitter_rad) for k in range(3)),
+        (np.log2(gain[:, 1]), WEBCAM.exposure),
+        (gain[:, 0] / gain[:, 1] - 1, WEBCAM.balance),
+        (gain[:, 2] / gain[:, 1] - 1, WEBCAM.balance),
     ):
         assert values.std() == pytest.approx(spread, rel=4 / np.sqrt(2 * n))
         assert abs(values.mean()) < 4 * spread / np.sqrt(n)
@@ -143,7 +143,7 @@ def middle(truth):
 
 @pytest.mark.parametrize(
     "sensor",
-    [DESK, Sensor(jitter_m=0.03), Sensor(jitter_rad=0.1)],
+    [WEBCAM, Sensor(jitter_m=0.03), Sensor(jitter_rad=0.1)],
     ids=["desk", "shifted", "turned"],
 )
 def test_the_reported_camera_is_the_one_that_took_the_picture(sensor, scene):
@@ -198,7 +198,7 @@ def test_a_knock_moves_a_point_by_focal_length_over_distance(scene):
 
 def test_a_camera_strays_once_and_then_stays(scene):
     """Neither stepping, nor restoring a snapshot, nor looking lets the knocks add up."""
-    desk = env(scene, DESK)
+    desk = env(scene, WEBCAM)
     first, kept = [cam.pose_world for cam in desk.cameras()], desk.snapshot()
     for _ in range(3):
         desk.observe()
@@ -215,6 +215,6 @@ def test_a_camera_strays_once_and_then_stays(scene):
 
 def test_global_seeding_changes_nothing(scene):
     np.random.seed(1)  # noqa: NPY002
-    one = env(scene, DESK, image_size=64).observe().images["front"]
+    one = env(scene, WEBCAM, image_size=64).observe().images["front"]
     np.random.seed(2)  # noqa: NPY002
-    assert (env(scene, DESK, image_size=64).observe().images["front"] == one).all()
+    assert (env(scene, WEBCAM, image_size=64).observe().images["front"] == one).all()

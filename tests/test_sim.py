@@ -10,7 +10,7 @@ from vap_core.base.types import Camera
 from vap_core.simulation import cameras, scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
-from vap_core.simulation.suites import WARM_UPS, Judge, Task, pick, rows
+from vap_core.simulation.suites import WARM_UPS, Judge, Task, layout, rows
 from vap_core.simulation.types import EpisodeRow, Placement
 
 import mujoco  # isort: skip
@@ -317,14 +317,14 @@ def take(env: Env, row: EpisodeRow) -> tuple[Judge, float]:
 def test_grasps_hold(name):
     """Every category, the personal object and two look-alikes, any yaw: at least 95 % are picked, and creep stays under 2 mm."""
     suite, won, crept = WARM_UPS[name], [], []
-    for k, category in enumerate(pick.CATEGORIES):
+    for k, category in enumerate(layout.PICKED):
         task = next(task for task in suite.tasks if task.category == category)
         with scenes.build(suite.robot, models_of(task)) as built:
             env = Env(built)
             for i, model in enumerate(models_of(task)):
                 rng = np.random.default_rng([9, k, i])
                 x, y, yaw = (
-                    pick.ARRANGEMENTS[name].x_m + rng.uniform(-0.025, 0.025),
+                    layout.ARRANGEMENTS[name].x_m + rng.uniform(-0.025, 0.025),
                     rng.uniform(-0.13, 0.13),
                     rng.uniform(-np.pi, np.pi),
                 )

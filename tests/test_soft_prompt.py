@@ -21,7 +21,7 @@ from vap_core.policies.protocol import SHIPPED
 from vap_core.rollout.prompters import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import Suite, wording
+from vap_core.simulation.suites import Suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.suite import Task
 from vap_core.study import engine, trials
@@ -85,7 +85,7 @@ def test_my_cup_becomes_a_word() -> None:
 def test_the_words_beside_the_object_stay(category: str, instruction: str, read: str) -> None:
     """The methods of one table read the same command of an own suite."""
     task = Task(name="own", category=category, instruction=instruction, max_steps=9)
-    wording.check(task)
+    check_wording(task)
     (row,) = suites.rows("widowx-pick", "pick-straw-cup", 1)
     own = replace(row, category=category, instruction=instruction)
     scene = build_scene(row.suite, [place.model for place in row.placements])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import UnknownName
-from vap_core.simulation.suites import WARM_UPS, pick, rows
+from vap_core.simulation.suites import WARM_UPS, layout, rows
 
 HASHES = {"widowx-pick": "5ffd241ec1089c2f", "franka-pick": "9ab6f5f161f891d5"}
 
@@ -57,7 +57,7 @@ def test_rows_keep_clear_and_in_reach(name):
         for row in rows(name, task.name, 40, seed=2):
             spots = np.array([[place.x, place.y] for place in row.placements])
             gaps = np.linalg.norm(spots[:, None] - spots[None], axis=2)[np.triu_indices(3, 1)]
-            assert gaps.min() >= pick.ARRANGEMENTS[name].clearance_m
+            assert gaps.min() >= layout.ARRANGEMENTS[name].clearance_m
             assert np.linalg.norm(spots, axis=1).max() < (0.40 if suite.robot == "wx250s" else 0.60)
             assert row.target.endswith("-personal")
             assert row.instruction == f"pick up my {row.category}"
@@ -73,4 +73,4 @@ def test_unknown_names_list_the_known_ones():
 
 def test_an_arrangement_that_cannot_keep_clear_is_refused():
     with pytest.raises(ValueError, match="cannot keep"):
-        pick.Arrangement(0.3, 0.1, 0.0, (0.0, 0.02), 0.09)
+        layout.Arrangement(0.3, 0.1, 0.0, (0.0, 0.02), 0.09)

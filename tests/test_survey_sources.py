@@ -11,7 +11,7 @@ import pytest
 
 import vap_core
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import BENCHMARKS, benchmark, simpler
+from vap_core.simulation.suites import BENCHMARKS, benchmark, benchmarks
 from vap_make.films import scenes
 from vap_make.objects import generic_instance
 
@@ -42,7 +42,7 @@ def test_whatever_a_benchmark_places_lies_outside_the_numbers_that_training_draw
     generic = [int(match[1]) for match in found if match]
     assert generic
     assert all(
-        scenes.TRAIN_INSTANCES <= simpler.NOVEL <= number < scenes.HELD_OUT for number in generic
+        scenes.TRAIN_INSTANCES <= benchmarks.NOVEL <= number < scenes.HELD_OUT for number in generic
     )
     assert {
         objects.get_object(name).split

@@ -7,9 +7,9 @@ import pytest
 
 from vap_core.base.errors import UnknownName
 from vap_core.base.files import DATA
-from vap_core.simulation.scene_style import DEFAULT_STYLE
-from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark, simpler
-from vap_core.simulation.suites.variants import Variant
+from vap_core.simulation.looks import DEFAULT_STYLE
+from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark, benchmarks
+from vap_core.simulation.suites.suite import Variant
 from vap_make.films import looks
 from vap_make.films.demonstrations import DISTRACTORS, draw_objects
 from vap_make.films.looks import APART, FIRST_GRAIN, distance, draw_look
@@ -86,7 +86,7 @@ def test_the_held_out_category_is_in_no_film_of_its_suite(suite: str) -> None:
 
 
 def test_distractors_of_films_are_no_distractors_of_the_evaluation() -> None:
-    assert TRAIN_INSTANCES < simpler.NOVEL
+    assert TRAIN_INSTANCES < benchmarks.NOVEL
     known = BENCHMARKS["simpler-fractal"]
     evaluated, filmed, scenes = set(), set(), 0
     for row in benchmark("simpler-fractal"):

@@ -14,7 +14,7 @@ from typing import Any
 
 from vap_core.base.errors import one_of
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import Task, simpler, suite, tabletop, vlabench
+from vap_core.simulation.suites import Task, benchmarks, suite
 from vap_core.simulation.suites.layout import Area
 
 
@@ -152,21 +152,21 @@ def _instead(task: Task, category: str) -> Task:
 
 FILMED: dict[str, Filmed] = {
     "simpler-bridge": Filmed(
-        area=simpler.FILMED_AREA,
-        instead=(_instead(simpler.BRIDGE.task("put-owl-figurine"), "vase"),),
+        area=benchmarks.FILMED_AREA,
+        instead=(_instead(benchmarks.BRIDGE.task("put-owl-figurine"), "vase"),),
         most=4,
     ),
     "simpler-fractal": Filmed(
-        area=simpler.DESK,
+        area=benchmarks.DESK,
         instead=(
-            _instead(simpler.FRACTAL.task("move-bottle-near-coke-can"), "vase"),
-            _instead(simpler.FRACTAL.task("move-bottle-near-coke-can"), "straw cup"),
+            _instead(benchmarks.FRACTAL.task("move-bottle-near-coke-can"), "vase"),
+            _instead(benchmarks.FRACTAL.task("move-bottle-near-coke-can"), "straw cup"),
         ),
         distractors=0.3,
     ),
-    "vlabench": Filmed(area=vlabench.TABLE),
-    "tabletop": Filmed(area=tabletop.TABLE, every=3),
-    "shared-pair": Filmed(area=tabletop.TABLE, every=3, pairs=True),
+    "vlabench": Filmed(area=benchmarks.VLABENCH_TABLE),
+    "tabletop": Filmed(area=benchmarks.TABLETOP_TABLE, every=3),
+    "shared-pair": Filmed(area=benchmarks.TABLETOP_TABLE, every=3, pairs=True),
 }
 """What differs between the films of the suites; a put on the tabletop uses tabletop.REACH."""
 

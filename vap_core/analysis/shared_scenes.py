@@ -17,7 +17,7 @@ from vap_core.base.pictures import FRAME, GRID, METHODS, TEXT, empty_figure
 from vap_core.policies.protocol import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
-from vap_core.simulation.suites.simpler import FILMED_AREA
+from vap_core.simulation.suites.benchmarks import FILMED_AREA
 from vap_core.study import paper
 from vap_core.study.parsers import KINDS
 from vap_core.study.results import read_runs

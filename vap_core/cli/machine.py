@@ -150,7 +150,7 @@ def _lists() -> tuple[str, str]:
 
 
 def _menagerie() -> tuple[str, str]:
-    from vap_core.simulation.robots.menagerie import MODELS
+    from vap_core.simulation.robots.mjcf import MODELS
 
     root = os.environ.get("MENAGERIE_ROOT")
     if not root:

@@ -4,7 +4,7 @@ from vap_core.instruction import parse
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import RIGS
-from vap_core.simulation.suites import Suite, shared, wording
+from vap_core.simulation.suites import Suite, own, shared
 
 
 def test_its_robot_and_cameras_exist(suite: Suite) -> None:
@@ -25,7 +25,7 @@ def test_every_instruction_has_one_personal_object_of_the_tasks_category(suite: 
     """Of shared scenes, which name several, the first."""
     for task in suite.tasks:
         if suite.name not in shared.SUITES:
-            wording.check(task)
+            own.check_wording(task)
         target, *others = parse(task.instruction, [task.category]).targets
         assert target.category == task.category, task.name
         assert not others or suite.name in shared.SUITES, task.name

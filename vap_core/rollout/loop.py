@@ -55,9 +55,9 @@ from vap_core.rollout.types import (
 )
 from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
+from vap_core.simulation.looks import PERFECT, Sensor
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
-from vap_core.simulation.sensor import PERFECT, Sensor
 from vap_core.simulation.suites.open_row import cameras_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Observation

@@ -5,7 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from vap_core.base.errors import BadRobot, UnknownName
 from vap_core.base.types import Camera, Mask, Rgb, value
@@ -14,8 +14,7 @@ from vap_core.simulation.gl import ensure_gl
 ensure_gl()
 import mujoco  # noqa: E402
 
-from vap_core.simulation.geoms import hand_geoms, object_of_geoms  # noqa: E402
-from vap_core.simulation.light import PLAIN_LIGHT, Light, dim  # noqa: E402
+from vap_core.simulation.looks import PLAIN_LIGHT, Light, dim  # noqa: E402
 from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
 
 HIDDEN_GROUP = 5
@@ -270,3 +269,22 @@ class Renderer:
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
         flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
+
+
+def object_of_geoms(model: mujoco.MjModel, objects: Sequence[str]) -> Int64[np.ndarray, " g"]:
+    """Of each geom the index into `objects` of its object, -1 for the rest of the scene."""
+    owners = np.full(model.nbody, -1, np.int64)
+    for i, name in enumerate(objects):
+        owners[model.body(name).id] = i
+    return owners[model.body_rootid[model.geom_bodyid]]
+
+
+def hand_geoms(model: mujoco.MjModel) -> Bool[np.ndarray, " g"]:
+    """Whether a geom is of the gripper: of the body that bears the tcp, or of one below it."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tcp")
+    of_hand = np.zeros(model.nbody, bool)
+    if site >= 0:
+        of_hand[model.site_bodyid[site]] = True
+    for body in range(1, model.nbody):  # a parent comes before its children
+        of_hand[body] |= of_hand[model.body_parentid[body]]
+    return of_hand[model.geom_bodyid]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from vap_core.base.types import value
-from vap_core.simulation.geoms import object_of_geoms
+from vap_core.simulation.cameras import object_of_geoms
 from vap_core.simulation.scenes import Scene
 
 ARM = -1

@@ -14,6 +14,7 @@ from jaxtyping import Float32, Float64
 from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
 from vap_core.base.types import Camera, Mask, Rgb, value
 from vap_core.simulation import cameras as optics
+from vap_core.simulation.cameras import hand_geoms
 from vap_core.simulation.contacts import (
     ARM,
     STILL,
@@ -30,17 +31,17 @@ from vap_core.simulation.control import (
     is_beyond,
     rotation_vector,
 )
-from vap_core.simulation.geoms import hand_geoms
-from vap_core.simulation.light import PLAIN_LIGHT, Light
-from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
-from vap_core.simulation.scenes import Scene, parked
-from vap_core.simulation.sensor import (
+from vap_core.simulation.looks import (
     PERFECT,
+    PLAIN_LIGHT,
     Disturbance,
+    Light,
     Sensor,
     apply_sensor,
     draw_disturbance,
 )
+from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
+from vap_core.simulation.scenes import Scene, parked
 from vap_core.simulation.types import EE_ACTION, REST, ROBOT, Action, EpisodeRow, Observation, Truth
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)

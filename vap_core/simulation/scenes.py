@@ -17,8 +17,8 @@ from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.mujoco_object import add_object
 from vap_core.simulation.cameras import Renderer, add_rigs
+from vap_core.simulation.looks import DEFAULT_STYLE, Colour3, SceneStyle
 from vap_core.simulation.robots import Robot, mjcf
-from vap_core.simulation.scene_style import DEFAULT_STYLE, Colour3, SceneStyle
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -74,7 +74,7 @@ def build(
     spec = mjcf.load(arm)
     physics(spec, arm.hz)
     if meshes == "menagerie":
-        from vap_core.simulation.robots.menagerie import replace_visuals
+        from vap_core.simulation.robots.mjcf import replace_visuals
 
         replace_visuals(spec, arm)
     _tint(spec, style.robot)

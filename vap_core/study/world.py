@@ -13,12 +13,11 @@ from vap_core.policies.scripted.scripted import MOTIONS, SHIPPED_MOTIONS
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.cameras import RIGS, SHIPPED_RIGS, Rig
+from vap_core.simulation.looks import SceneStyle, Sensor
 from vap_core.simulation.robots import Robot, mjcf
-from vap_core.simulation.scene_style import SceneStyle
-from vap_core.simulation.sensor import Sensor
 from vap_core.simulation.suites import Suite, Task
 from vap_core.simulation.suites.open_row import models_of
-from vap_core.simulation.suites.variants import VARIANTS, Variant
+from vap_core.simulation.suites.suite import VARIANTS, Variant
 from vap_core.simulation.types import EpisodeRow
 
 SPELLINGS: dict[type, str] = {

@@ -26,7 +26,7 @@ from vap_core.rollout.running import expert_steps
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene, build
-from vap_core.simulation.suites import Suite, Task, suite, tabletop
+from vap_core.simulation.suites import Suite, Task, benchmarks, suite
 from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, random_yaw, scatter
 from vap_core.simulation.suites.open_row import make_env
 from vap_core.simulation.types import EpisodeRow, Placement
@@ -160,8 +160,8 @@ def row(
     fixed: dict[str, Spot] = {}
     area = FILMED[known.name].area
     if task.goal and known.name == "tabletop":
-        fixed[task.goal] = tabletop.BOWLS[int(rng.integers(2))]
-        area = tabletop.REACH
+        fixed[task.goal] = benchmarks.BOWLS[int(rng.integers(2))]
+        area = benchmarks.REACH
     loose = [name for name in things + goals if name not in fixed]
     spots = dict(zip(loose, _spots(rng, area, loose, fixed), strict=True))
     spots.update(fixed)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from vap_core.simulation.scene_style import Colour3, SceneStyle
-from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.looks import Colour3, SceneStyle
+from vap_core.simulation.suites.suite import VARIANTS
 
 APART = {
     "planks": 0.08,

@@ -20,7 +20,7 @@ from vap_core.base.types import value
 from vap_core.simulation import robots, scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import ObjectModel
-from vap_core.simulation.scene_style import DEFAULT_STYLE, Colour3, SceneStyle
+from vap_core.simulation.looks import DEFAULT_STYLE, Colour3, SceneStyle
 from vap_core.simulation.studio import Shot, Stage
 from vap_make.folder import kept_arrays
 from vap_make.objects import generic_instance

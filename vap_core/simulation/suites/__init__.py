@@ -17,14 +17,12 @@ import numpy as np
 from vap_core.base.errors import BadSuite, UnknownName, one_of
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import development, lists, own, own_object, pick, shared, starts
+from vap_core.simulation.suites import development, layout, lists, own, shared, starts
+from vap_core.simulation.suites.benchmarks import BRIDGE, FRACTAL, TABLETOP, VLABENCH
 from vap_core.simulation.suites.rules import Judge as Judge
-from vap_core.simulation.suites.simpler import BRIDGE, FRACTAL
+from vap_core.simulation.suites.suite import VARIANTS as VARIANTS
 from vap_core.simulation.suites.suite import Suite as Suite
 from vap_core.simulation.suites.suite import Task as Task
-from vap_core.simulation.suites.tabletop import TABLETOP
-from vap_core.simulation.suites.variants import VARIANTS as VARIANTS
-from vap_core.simulation.suites.vlabench import VLABENCH
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 BENCHMARKS: dict[str, Suite] = {
@@ -33,7 +31,7 @@ BENCHMARKS: dict[str, Suite] = {
     "vlabench": VLABENCH,
     "tabletop": TABLETOP,
 }
-WARM_UPS: dict[str, Suite] = {"widowx-pick": pick.WIDOWX, "franka-pick": pick.FRANKA}
+WARM_UPS: dict[str, Suite] = {"widowx-pick": layout.WIDOWX, "franka-pick": layout.FRANKA}
 SHARED: dict[str, Suite] = shared.SUITES
 """Scenes that two people share: two objects in turn, or two at once."""
 SUITES: dict[str, Suite] = {**BENCHMARKS, **SHARED, **WARM_UPS}
@@ -182,7 +180,7 @@ def rows(
     known = suite(suite_name)
     task = known.task(task_name)
     if suite_name in WARM_UPS:
-        return _of_split(pick.rows(known, task, 20 if n is None else n, seed), split)
+        return _of_split(layout.pick_rows(known, task, 20 if n is None else n, seed), split)
     episodes = _of_split(_seeded(suite_name, task_name, seed), split)
     if n is not None and n < len(episodes):
         spread = np.linspace(0, len(episodes) - 1, n).astype(int)
@@ -237,13 +235,13 @@ def listed(
     """
     if own_target:
         everything = tuple(known for known in SUITES.values() if known.name not in SHARED)
-        own_object.check_category(own_target, suite(suite_name), task_name, everything)
+        starts.check_category(own_target, suite(suite_name), task_name, everything)
     episodes: list[EpisodeRow] = []
     for row_seed in range(seed, seed + seeds):
         drawn = rows(suite_name, task_name, n, row_seed, split)
         if own_target:
             whole = rows(suite_name, task_name, seed=row_seed)
-            drawn = own_object.with_object(drawn, own_target, whole)
+            drawn = starts.with_object(drawn, own_target, whole)
         episodes.extend(drawn)
     return tuple(episodes)
 

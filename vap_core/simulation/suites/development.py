@@ -11,7 +11,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from vap_core.simulation.suites import simpler, tabletop, vlabench
+from vap_core.simulation.suites import benchmarks
 from vap_core.simulation.suites.layout import (
     Spot,
     nearest_m,
@@ -62,8 +62,8 @@ def _square(
     turn = float(rng.uniform(*TURNS_RAD)) * (-1) ** (episode // 12)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     corners: list[Spot] = []
-    for corner in product((-simpler.CORNER_M, simpler.CORNER_M), repeat=2):
-        x, y = rotation @ corner + simpler.CENTRE
+    for corner in product((-benchmarks.CORNER_M, benchmarks.CORNER_M), repeat=2):
+        x, y = rotation @ corner + benchmarks.CENTRE
         corners.append((float(x), float(y)))
     orders = list(permutations(range(4), 2))
     first, goal = orders[episode % 12]
@@ -80,13 +80,13 @@ def _desk(
     """Between the places of simpler-fractal's grid, or around the goal."""
     if task.goal:
         return _around_the_goal(rng, task, episode, names)
-    steps = simpler.GRID - 1
+    steps = benchmarks.GRID - 1
     grid = []
     for i, j in product(range(steps), repeat=2):
-        grid.append(simpler.DESK.at((i + 0.5) / steps, (j + 0.5) / steps))
+        grid.append(benchmarks.DESK.at((i + 0.5) / steps, (j + 0.5) / steps))
     taken = [grid[episode % len(grid)]]
     for i in rng.permutation(len(grid)).tolist():
-        if len(taken) < 3 and nearest_m(grid[i], taken) > simpler.BESIDE_M:
+        if len(taken) < 3 and nearest_m(grid[i], taken) > benchmarks.BESIDE_M:
             taken.append(grid[i])
     return tuple(place_at_random_yaws(rng, names, taken))
 
@@ -97,10 +97,10 @@ def _around_the_goal(
     """The target is the nearest to the goal, the middle one and the farthest in turn."""
     wide = max(map(radius_m, names))
     while True:
-        goal, *spots = scatter(rng, simpler.DESK, [0.06, wide, wide, wide], gap_m=0.065)
+        goal, *spots = scatter(rng, benchmarks.DESK, [0.06, wide, wide, wide], gap_m=0.065)
         spots.sort(key=lambda spot: nearest_m(spot, [goal]))
-        edge_m = min(goal[0] - simpler.DESK.x0, simpler.DESK.x1 - goal[0])
-        if nearest_m(spots[0], [goal]) > simpler.APART_M and edge_m > 0.03:
+        edge_m = min(goal[0] - benchmarks.DESK.x0, benchmarks.DESK.x1 - goal[0])
+        if nearest_m(spots[0], [goal]) > benchmarks.APART_M and edge_m > 0.03:
             break
     first = spots.pop(episode % 3)
     target, *rivals = place_at_random_yaws(rng, names, [first, *spots])
@@ -111,7 +111,7 @@ def _table(
     rng: np.random.Generator, task: Task, episode: int, names: list[str]
 ) -> tuple[Placement, ...]:
     """Anywhere on vlabench's table."""
-    return scattered(rng, vlabench.TABLE, names, gap_m=0.05)
+    return scattered(rng, benchmarks.VLABENCH_TABLE, names, gap_m=0.05)
 
 
 def _tabletop(
@@ -119,10 +119,10 @@ def _tabletop(
 ) -> tuple[Placement, ...]:
     """Anywhere on the desk of the SO-101, or within its reach beside the bowl."""
     if not task.goal:
-        return scattered(rng, tabletop.TABLE, names, gap_m=0.035)
-    bowl = tabletop.BOWLS[episode % 2]
+        return scattered(rng, benchmarks.TABLETOP_TABLE, names, gap_m=0.035)
+    bowl = benchmarks.BOWLS[episode % 2]
     fixed = [(bowl, radius_m(task.goal) / np.sqrt(2))]
-    target, *rivals = scattered(rng, tabletop.REACH, names, gap_m=0.03, fixed=fixed)
+    target, *rivals = scattered(rng, benchmarks.REACH, names, gap_m=0.03, fixed=fixed)
     return (target, place(task.goal, bowl, 0.0), *rivals)
 
 

@@ -18,8 +18,7 @@ from jaxtyping import TypeCheckError
 from vap_core.base.errors import BadSuite
 from vap_core.base.files import DATA, parse_json, read_file, write_atomic
 from vap_core.simulation import robots
-from vap_core.simulation.suites.suite import Suite
-from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.suites.suite import VARIANTS, Suite
 from vap_core.simulation.types import EpisodeRow, Owned, Placement, SubGoal
 
 FOLDER = DATA / "suites"
@@ -243,10 +242,10 @@ def _faults(row: EpisodeRow) -> Iterator[tuple[str, str]]:
     for each in row.owned:
         if each.model not in names:
             yield "owned", f"{each.model!r} is not placed"
-    for each in row.subgoals:
-        others = {*names} - {each.target}
-        goals = others if each.rule in ("near", "put") else {""}
-        if each.target not in names or each.goal not in goals or each.max_steps < 1:
-            yield "subgoals", f"{each.rule} {each.target!r} with the goal {each.goal!r} will not do"
+    for step in row.subgoals:
+        others = {*names} - {step.target}
+        goals = others if step.rule in ("near", "put") else {""}
+        if step.target not in names or step.goal not in goals or step.max_steps < 1:
+            yield "subgoals", f"{step.rule} {step.target!r} with the goal {step.goal!r} will not do"
     if row.subgoals and row.subgoals[0].target != names[0]:
         yield "subgoals", f"the first is about {row.subgoals[0].target!r}, not the target"

@@ -8,7 +8,7 @@ from vap_core.simulation.env import Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene, build
 from vap_core.simulation.suites import suite as suite_called
-from vap_core.simulation.suites.variants import VARIANTS
+from vap_core.simulation.suites.suite import VARIANTS
 from vap_core.simulation.types import EpisodeRow
 
 

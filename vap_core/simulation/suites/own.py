@@ -14,14 +14,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vap_core.base.errors import BadSuite, VapError, one_of
+from vap_core.base.errors import BadInstruction, BadSuite, VapError, one_of
 from vap_core.base.types import value
+from vap_core.instruction import parse
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
 from vap_core.simulation.cameras import add_rigs
 from vap_core.simulation.robots import Robot, mjcf
-from vap_core.simulation.suites import lists, wording
-from vap_core.simulation.suites.suite import Suite
+from vap_core.simulation.suites import lists
+from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 VARIABLE = "VAP_SUITES"
@@ -139,7 +140,7 @@ def _check_tasks(suite: Suite) -> None:
     """Raises: BadSuite: a task's words do not fit, or two tasks have one name."""
     names = set()
     for task in suite.tasks:
-        wording.check(task)
+        check_wording(task)
         if task.name in names:
             raise BadSuite(f"two tasks are called {task.name}; rename one")
         names.add(task.name)
@@ -226,3 +227,20 @@ def _digest(rows: Iterable[EpisodeRow]) -> str:
         if start != repr(AS_LISTED):
             digest.update(start.encode())
     return digest.hexdigest()
+
+
+def check_wording(task: Task) -> None:
+    """Refuse an instruction that does not name one personal object, of the task's category.
+
+    Raises: BadSuite, naming the task.
+    """
+    where = f"task {task.name}: the instruction {task.instruction!r}"
+    mend = f'write "my {task.category}" in it once, or correct the category'
+    try:
+        targets = parse(task.instruction, (task.category,)).targets
+    except BadInstruction:
+        raise BadSuite(f"{where} names no personal object; {mend}.") from None
+    named = [target.category for target in targets]
+    if named != [task.category]:
+        asked = " and ".join(f"my {category}" for category in named)
+        raise BadSuite(f"{where} asks for {asked}, and the category is {task.category!r}; {mend}.")

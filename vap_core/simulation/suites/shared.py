@@ -22,7 +22,7 @@ import numpy as np
 from vap_core.base.types import value
 from vap_core.instruction.expressions import decompose
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import simpler, tabletop
+from vap_core.simulation.suites import benchmarks
 from vap_core.simulation.suites.layout import (
     Spot,
     draw_lookalikes,
@@ -50,7 +50,7 @@ HARDEST = {
     "slipper": "slipper-lookalike-1",
 }
 """The look-alike of greatest mean cosine with the personal instance's photos, by stem."""
-BOWL = tabletop.BOWL
+BOWL = benchmarks.BOWL
 PLATE = "plate-prop"
 BASKET = "basket-prop"
 EPISODES = 20
@@ -233,9 +233,9 @@ def _suite(name: str, like: Suite) -> Suite:
 
 
 SUITES = {
-    "shared-sequence": _suite("shared-sequence", tabletop.TABLETOP),
-    "shared-sequence-bridge": _suite("shared-sequence-bridge", simpler.BRIDGE),
-    "shared-pair": _suite("shared-pair", tabletop.TABLETOP),
+    "shared-sequence": _suite("shared-sequence", benchmarks.TABLETOP),
+    "shared-sequence-bridge": _suite("shared-sequence-bridge", benchmarks.BRIDGE),
+    "shared-pair": _suite("shared-pair", benchmarks.TABLETOP),
 }
 LIKE = {
     "shared-sequence": "tabletop",
@@ -294,7 +294,7 @@ def _on_grid(shared: Shared, rng: np.random.Generator, episode: int) -> tuple[Pl
     spots: list[Spot] = []
     for i in (-0.5, 0.5):
         for j in (-1, 0, 1):
-            spots.append((simpler.CENTRE[0] + PITCH_M * i, simpler.CENTRE[1] + PITCH_M * j))
+            spots.append((benchmarks.CENTRE[0] + PITCH_M * i, benchmarks.CENTRE[1] + PITCH_M * j))
     order = np.random.default_rng([92, *shared.name.encode()]).permutation(30)
     pairs = list(permutations(range(6), 2))
     taken = list(pairs[int(order[episode])])
@@ -312,7 +312,7 @@ def _on_desk(shared: Shared, rng: np.random.Generator) -> tuple[Placement, ...]:
     What is grasped, and its look-alikes, stand within the arm's reach; everything else anywhere.
     """
     models = _models(shared, rng)
-    bowl = tabletop.BOWLS[int(rng.integers(2))]
+    bowl = benchmarks.BOWLS[int(rng.integers(2))]
     has_bowl = any(step.goal == BOWL for step in shared.steps)
     fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))] if has_bowl else []
     grasped = {step.category for step in shared.steps if step.rule != "selected"}
@@ -347,7 +347,7 @@ def try_desk(
     spots: dict[str, Spot] = {}
     taken = list(fixed)
     rest = [name for name in models if name not in within]
-    for area, names in ((tabletop.REACH, within), (tabletop.TABLE, rest)):
+    for area, names in ((benchmarks.REACH, within), (benchmarks.TABLETOP_TABLE, rest)):
         radii = list(map(radius_m, names))
         try:
             drawn = scatter(rng, area, radii, fixed=taken, gap_m=gap_m, tries=20)
@@ -375,7 +375,7 @@ def _has_room(target: str, goal: str, lookalike: str, spots: Mapping[str, Spot])
         distance = radius_m(target) + radius_m(goal) + beside
         for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
             x, y = here + distance * np.array([np.cos(angle), np.sin(angle)])
-            reach = tabletop.REACH
+            reach = benchmarks.REACH
             if not (reach.x0 < x < reach.x1 and reach.y0 < y < reach.y1):
                 continue
             gaps = [np.hypot(x - spots[name][0], y - spots[name][1]) for name in others]

@@ -8,11 +8,16 @@ seed's change depends on the seed and the layout alone: the variants of a layout
 """
 
 import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from vap_core.simulation.types import EpisodeRow, Start
+from vap_core.base.errors import BadStudy
+from vap_core.simulation.assets import objects
+from vap_core.simulation.suites.layout import Spot
+from vap_core.simulation.suites.suite import Suite
+from vap_core.simulation.types import EpisodeRow, Placement, Start
 
 
 @dataclass(frozen=True)
@@ -90,3 +95,109 @@ def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
 def _rounded(values: np.ndarray) -> tuple[float, ...]:
     """Rounded as in the lists, to 0.1 mm and 0.1 mrad."""
     return tuple(np.round(values, 4).tolist())
+
+
+APART_M = 0.01
+"""Room between the object's disc and its neighbours' discs."""
+
+
+def with_object(
+    rows: Sequence[EpisodeRow], name: str, whole: Sequence[EpisodeRow]
+) -> tuple[EpisodeRow, ...]:
+    """The rows of one task with the object `name` as their target.
+
+    It takes the place and turn of the listed target. Where it is too wide for that, it takes the
+    nearest target place of the task's `whole` list that has room.
+
+    Raises: UnknownName; BadObject; BadStudy for an object of another category, one that stands
+        there already, or one that fits nowhere, and for a shared scene, which names its objects.
+    """
+    for row in rows:
+        if row.owned or row.subgoals:
+            raise BadStudy(
+                f"--object: {row.suite}/{row.task} is a scene that people share, and names the "
+                "objects that they own; take a task of another suite."
+            )
+    spots = _target_spots(whole)
+    radii_m = _disc_radii_m(rows, name)
+    return tuple(_replaced(row, name, spots, radii_m) for row in rows)
+
+
+def check_category(name: str, suite: Suite, task_name: str, known: Iterable[Suite]) -> None:
+    """Refuse an object of another category than the task's.
+
+    Raises: UnknownName; BadObject; BadStudy, which names the tasks of `known` that it fits.
+    """
+    model = objects.get_object(name)
+    wanted = suite.task(task_name).category
+    if model.category == wanted:
+        return
+    fitting = []
+    for other in known:
+        for task in other.tasks:
+            if task.category == model.category:
+                fitting.append(f"{other.name}/{task.name}")
+    remedy = f"import it with --category {wanted!r}, if it is one"
+    if fitting:
+        remedy = f"take a task with a {model.category}: {', '.join(fitting)}"
+    raise BadStudy(
+        f"--object: {name} is a {model.category}, and {suite.name}/{task_name} asks for a "
+        f"{wanted}; {remedy}."
+    )
+
+
+def _target_spots(rows: Sequence[EpisodeRow]) -> tuple[Spot, ...]:
+    """The places of the rows' targets, each once."""
+    spots: dict[Spot, None] = {}
+    for row in rows:
+        target = row.placements[0]
+        spots[target.x, target.y] = None
+    return tuple(spots)
+
+
+def _disc_radii_m(rows: Sequence[EpisodeRow], name: str) -> dict[str, float]:
+    """The radius of the disc that an object's outline fits in, for `name` and all in the rows."""
+    names = {name}
+    for row in rows:
+        names.update(place.model for place in row.placements)
+    radii_m = {}
+    for each in names:
+        vertex = objects.mesh_of(objects.get_object(each)).vertex[:, :2]
+        centre = (vertex.min(axis=0) + vertex.max(axis=0)) / 2
+        radii_m[each] = float(np.linalg.norm(vertex - centre, axis=1).max())
+    return radii_m
+
+
+def _replaced(
+    row: EpisodeRow, name: str, spots: Sequence[Spot], radii_m: Mapping[str, float]
+) -> EpisodeRow:
+    """The row with the object as its target."""
+    target, *others = row.placements
+    if name in [place.model for place in others]:
+        raise BadStudy(
+            f"--object: {name} is one of the objects around the target of {row.suite}/{row.task}; "
+            "name another object."
+        )
+
+    def away_m(spot: Spot) -> float:
+        return float(np.hypot(spot[0] - target.x, spot[1] - target.y))
+
+    for spot in sorted(spots, key=away_m):
+        if _has_room(name, spot, others, radii_m):
+            place = replace(target, model=name, x=spot[0], y=spot[1])
+            return replace(row, placements=(place, *others))
+    raise BadStudy(
+        f"--object: {name} is too wide to stand among the objects of {row.suite}/{row.task} "
+        f"(episode {row.episode}); import it again with a smaller --height-cm."
+    )
+
+
+def _has_room(
+    name: str, spot: Spot, others: Sequence[Placement], radii_m: Mapping[str, float]
+) -> bool:
+    """Whether the object's disc keeps `APART_M` to every other object's."""
+    for other in others:
+        apart_m = float(np.hypot(spot[0] - other.x, spot[1] - other.y))
+        if apart_m < radii_m[name] + radii_m[other.model] + APART_M:
+            return False
+    return True

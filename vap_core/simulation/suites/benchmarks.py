@@ -12,6 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 
+from vap_core.simulation.looks import WEBCAM
 from vap_core.simulation.suites.layout import (
     Area,
     draw_lookalikes,
@@ -21,9 +22,9 @@ from vap_core.simulation.suites.layout import (
     radius_m,
     random_yaw,
     scatter,
+    scattered,
 )
-from vap_core.simulation.suites.suite import Suite, Task
-from vap_core.simulation.suites.variants import AGGREGATION, MATCHING, VARIANTS
+from vap_core.simulation.suites.suite import AGGREGATION, MATCHING, VARIANTS, Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
 
 FRACTAL = Suite(
@@ -32,19 +33,14 @@ FRACTAL = Suite(
     hz=3.0,
     cameras=("head",),
     tasks=(
+        Task("pick-pen-holder", "pen holder", "pick my pen holder", 80),
         Task(
-            name="pick-pen-holder",
-            category="pen holder",
-            instruction="pick my pen holder",
-            max_steps=80,
-        ),
-        Task(
-            name="move-bottle-near-coke-can",
-            category="bottle",
-            instruction="move my bottle near coke can",
-            max_steps=80,
-            rule="near",
-            goal="coke-can-prop",
+            "move-bottle-near-coke-can",
+            "bottle",
+            "move my bottle near coke can",
+            80,
+            "near",
+            "coke-can-prop",
         ),
     ),
 )
@@ -54,35 +50,21 @@ BRIDGE = Suite(
     hz=5.0,
     cameras=("front",),
     tasks=(
-        Task(
-            name="pick-shaver",
-            category="shaver",
-            instruction="pick up my shaver",
-            max_steps=60,
-        ),
-        Task(
-            name="put-camera",
-            category="camera",
-            instruction="put my camera on the plate",
-            max_steps=60,
-            rule="put",
-            goal="plate-prop",
-        ),
-        Task(
-            name="put-owl-figurine",
-            category="owl figurine",
-            instruction="put my owl figurine on the plate",
-            max_steps=60,
-            rule="put",
-            goal="plate-prop",
-        ),
-        Task(
-            name="put-straw-cup",
-            category="straw cup",
-            instruction="put my straw cup in the basket",
-            max_steps=120,
-            rule="put",
-            goal="basket-prop",
+        Task("pick-shaver", "shaver", "pick up my shaver", 60),
+        *(
+            Task(
+                f"put-{category.replace(' ', '-')}",
+                category,
+                f"put my {category} {where}",
+                steps,
+                "put",
+                goal,
+            )
+            for category, where, steps, goal in (
+                ("camera", "on the plate", 60, "plate-prop"),
+                ("owl figurine", "on the plate", 60, "plate-prop"),
+                ("straw cup", "in the basket", 120, "basket-prop"),
+            )
         ),
     ),
 )
@@ -109,14 +91,10 @@ def fractal_rows() -> tuple[EpisodeRow, ...]:
     The layouts are the same under every variant, so that variants compare pairwise.
     """
     pick, near = FRACTAL.tasks
-    pick_layouts = []
-    for turn, cell in product(range(ORIENTATIONS), range(GRID * GRID)):
-        pick_layouts.append(_pick(pick, turn, cell))
-    near_layouts = []
-    for i in range(LAYOUTS):
-        near_layouts.append(_near(near, i))
-    near_variants = list(AGGREGATION)
-    near_variants.remove("distractors-many")
+    cells = product(range(ORIENTATIONS), range(GRID * GRID))
+    pick_layouts = [_pick(pick, turn, cell) for turn, cell in cells]
+    near_layouts = [_near(near, i) for i in range(LAYOUTS)]
+    near_variants = [name for name in AGGREGATION if name != "distractors-many"]
     return (
         *_rows_of_variants(pick, pick_layouts, AGGREGATION),
         *_rows_of_variants(near, near_layouts, near_variants),
@@ -125,21 +103,15 @@ def fractal_rows() -> tuple[EpisodeRow, ...]:
 
 def bridge_rows() -> tuple[EpisodeRow, ...]:
     """All 4 x 24 episodes."""
-    rows = []
-    for task, i in product(BRIDGE.tasks, range(24)):
-        rows.append(BRIDGE.row(task, i, _square(task, i)))
-    return tuple(rows)
+    return BRIDGE.rows_of(24, _square)
 
 
 def _rows_of_variants(
     task: Task, layouts: Sequence[tuple[Placement, ...]], aggregation: Sequence[str]
 ) -> list[EpisodeRow]:
     """Every layout under every variant of visual matching, then of variant aggregation."""
-    settings = []
-    for variant in MATCHING:
-        settings.append(("visual matching", variant))
-    for variant in aggregation:
-        settings.append(("variant aggregation", variant))
+    settings = [("visual matching", variant) for variant in MATCHING]
+    settings += [("variant aggregation", variant) for variant in aggregation]
     rows: list[EpisodeRow] = []
     for split, variant in settings:
         n_distractors = VARIANTS[variant].distractors
@@ -156,9 +128,8 @@ def _pick(task: Task, turn: int, cell: int) -> tuple[Placement, ...]:
     """
     rng = np.random.default_rng([41, turn, cell])
     yaw = random_yaw(np.random.default_rng([45, cell])) + 2 * np.pi / ORIENTATIONS * turn
-    grid = []
-    for i, j in product(range(GRID), range(GRID)):
-        grid.append(DESK.at(i / (GRID - 1), j / (GRID - 1)))
+    shares = product(np.arange(GRID) / (GRID - 1), repeat=2)
+    grid = [DESK.at(float(u), float(v)) for u, v in shares]
     taken = [grid[cell]]
     for i in rng.permutation(len(grid)).tolist():
         if len(taken) < 3 and nearest_m(grid[i], taken) > BESIDE_M:
@@ -177,10 +148,7 @@ def _near(task: Task, layout: int) -> tuple[Placement, ...]:
     wide = max(map(radius_m, [task.personal, *names]))
     while True:
         can, *bottles = scatter(rng, DESK, [0.06, wide, wide, wide], gap_m=0.065)
-        distances = []
-        for x, y in bottles:
-            distances.append((float(np.hypot(can[0] - x, can[1] - y)), (x, y)))
-        distances.sort()
+        distances = sorted((nearest_m(bottle, [can]), bottle) for bottle in bottles)
         if distances[0][0] > APART_M and DESK.x0 + 0.03 < can[0] < DESK.x1 - 0.03:
             break
     _, target = distances.pop(layout % 3)
@@ -216,9 +184,8 @@ def _square(task: Task, episode: int) -> tuple[Placement, ...]:
     """The target and the goal on two corners of a square, the look-alikes on the others."""
     name = task.name.encode()
     rng = np.random.default_rng([44, *name, episode])
-    corners = []
-    for i, j in product((-1, 1), (-1, 1)):
-        corners.append((CENTRE[0] + CORNER_M * i, CENTRE[1] + CORNER_M * j))
+    steps = product((-CORNER_M, CORNER_M), repeat=2)
+    corners = [(CENTRE[0] + i, CENTRE[1] + j) for i, j in steps]
     orders = list(permutations(range(4), 2))
     target, goal = orders[episode % 12]
     others = [corners[i] for i in range(4) if i not in (target, goal)]
@@ -228,3 +195,81 @@ def _square(task: Task, episode: int) -> tuple[Placement, ...]:
     if task.goal:
         placements.append(place(task.goal, corners[goal], 0.0))
     return (*placements, *place_at_random_yaws(rng, draw_lookalikes(rng, task.stem), others))
+
+
+def _select(category: str, max_steps: int = 150, slug: str = "") -> Task:
+    name, words = f"select-{category.replace(' ', '-')}", f"select my {category}"
+    return Task(name, category, words, max_steps, "selected", slug=slug)
+
+
+VLABENCH = Suite(
+    name="vlabench",
+    robot="panda",
+    hz=10.0,
+    cameras=("front", "side", "wrist"),
+    control="joint",
+    tasks=(
+        *map(_select, ("leather bag", "shoe", "cat figurine", "miniature house")),
+        _select("cup", 200, "paper-cup"),
+    ),
+)
+VLABENCH_TABLE = Area(x0=0.38, x1=0.54, y0=-0.17, y1=0.17)
+VLABENCH_EPISODES = 50
+
+
+def vlabench_rows() -> tuple[EpisodeRow, ...]:
+    """All 5 x 50 episodes."""
+    return VLABENCH.rows_of(VLABENCH_EPISODES, _on_table)
+
+
+def _on_table(task: Task, episode: int) -> tuple[Placement, ...]:
+    rng = np.random.default_rng([51, *task.name.encode(), episode])
+    names = [task.personal, *draw_lookalikes(rng, task.stem)]
+    return scattered(rng, VLABENCH_TABLE, names, gap_m=0.05)
+
+
+BOWL = "plastic-bowl-prop"
+
+
+def _put(category: str) -> Task:
+    name, words = f"put-{category.replace(' ', '-')}", f"put my {category} into the plastic bowl"
+    return Task(name, category, words, 300, "put", BOWL)
+
+
+TABLETOP = Suite(
+    name="tabletop",
+    robot="so101",
+    hz=30.0,
+    cameras=("front", "side", "wrist"),
+    control="joint",
+    sensor=WEBCAM,
+    tasks=(
+        *map(_select, ("vase", "plushie", "cup", "slipper")),
+        *map(_put, ("plant", "stuffed toy", "pouch", "scrubber")),
+    ),
+)
+TABLETOP_TABLE = Area(x0=0.15, x1=0.30, y0=-0.19, y1=0.19)
+REACH = Area(x0=0.165, x1=0.275, y0=-0.145, y1=0.145)
+"""Where the SO-101 grasps from above.
+
+All three objects of a put stand here, so that their places do not reveal the target.
+"""
+BOWLS = ((0.215, 0.16), (0.215, -0.16))
+"""The bowl stands on one side or the other."""
+TABLETOP_EPISODES = 20
+
+
+def tabletop_rows() -> tuple[EpisodeRow, ...]:
+    """All 8 x 20 episodes."""
+    return TABLETOP.rows_of(TABLETOP_EPISODES, _on_desk)
+
+
+def _on_desk(task: Task, episode: int) -> tuple[Placement, ...]:
+    rng = np.random.default_rng([61, *task.name.encode(), episode])
+    names = [task.personal, *draw_lookalikes(rng, task.stem)]
+    bowl = BOWLS[int(rng.integers(2))]
+    if not task.goal:
+        return scattered(rng, TABLETOP_TABLE, names, gap_m=0.035)
+    fixed = [(bowl, radius_m(BOWL) / np.sqrt(2))]
+    target, *lookalikes = scattered(rng, REACH, names, gap_m=0.03, fixed=fixed)
+    return (target, place(BOWL, bowl, 0.0), *lookalikes)

@@ -1,15 +1,20 @@
-"""The errors of real cameras: displaced mounts, different exposures and noise.
+"""How things look: a variant's room, its light, and the errors of real cameras.
 
-All are drawn from the episode.
+Displaced mounts, different exposures and noise are all drawn from the episode. This module loads no
+simulator.
 """
 
 import zlib
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.types import EpisodeRow
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @value
@@ -29,7 +34,7 @@ class Sensor:
 
 
 PERFECT = Sensor()
-DESK = Sensor(jitter_m=0.004, jitter_rad=0.012, exposure=0.18, balance=0.03, noise=2.5)
+WEBCAM = Sensor(jitter_m=0.004, jitter_rad=0.012, exposure=0.18, balance=0.03, noise=2.5)
 """A webcam on a clamp that is mounted again every day."""
 
 
@@ -77,3 +82,54 @@ def apply_sensor(
     np.rint(picture, out=picture)
     np.clip(picture, 0, 255, out=picture)
     return picture.astype(np.uint8)
+
+
+Colour3 = tuple[float, float, float]
+
+
+@value
+class SceneStyle:
+    """The look of the room; colours are linear 0..1.
+
+    `planks` are the table's light and dark wood, or one colour twice for a plain top; `grain` is
+    the seed of its boards. `lamp_pos_m` and `lamp` place and dim the one lamp, `ambient` is the
+    fill light; `shadows` are off because they triple the frame time. `robot` multiplies every
+    colour of the robot; `camera_shift_m` moves the fixed cameras, in the frame of the body that
+    carries them, while they look at the same point.
+    """
+
+    planks: tuple[Colour3, Colour3] = ((0.80, 0.69, 0.55), (0.70, 0.58, 0.44))
+    grain: int = 7
+    wall: Colour3 = (0.73, 0.76, 0.78)
+    floor: Colour3 = (0.43, 0.42, 0.42)
+    lamp_pos_m: tuple[float, float, float] = (0.9, -0.6, 1.8)
+    lamp: float = 0.55
+    ambient: float = 0.38
+    shadows: bool = False
+    robot: Colour3 = (1.0, 1.0, 1.0)
+    camera_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+DEFAULT_STYLE = SceneStyle()
+
+
+@value
+class Light:
+    """What the light of the lamp, and that of the room, are multiplied by."""
+
+    lamp: float = 1.0
+    ambient: float = 1.0
+
+
+PLAIN_LIGHT = Light()
+
+
+def dim(scene: "mujoco.MjvScene", light: Light) -> None:
+    """Multiply the light of a picture before it is rendered; the room's is the headlight's."""
+    if light.lamp == light.ambient == 1.0:
+        return
+    for lamp in scene.lights[: scene.nlight]:
+        if lamp.headlight:
+            lamp.ambient[:] *= np.float32(light.ambient)
+        else:
+            lamp.diffuse[:] *= np.float32(light.lamp)
