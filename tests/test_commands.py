@@ -29,12 +29,6 @@ def test_every_word_and_variable_is_read_back() -> None:
     assert command("eval", "--episodes", "4") == "python -m vap_core eval --episodes 4"
 
 
-def test_the_command_after_designs_is_read_back(tmp_path: Path) -> None:
-    done = vap("objects", "designs", tmp_path / ODD, "--count", "1")
-    words = ["python", "-m", "vap_core", "measure", "objects", str(tmp_path / ODD)]
-    assert next_words(done.stdout) == words
-
-
 def test_the_command_after_photographs_is_read_back(tmp_path: Path) -> None:
     out = tmp_path / ODD
     done = vap("objects", "photograph", "cup-personal", "--out", out, "--views", "2")

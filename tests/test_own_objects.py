@@ -1,4 +1,4 @@
-"""measure objects: made-up designs, the folder form, what is wrong with bad folders, the figures, and resuming."""
+"""measure objects: the folder form, what is wrong with bad folders, the figures, and resuming."""
 
 import os
 import shlex
@@ -12,11 +12,8 @@ from tqdm import tqdm
 
 from tests.command import refused, vap
 from tests.scanned import box, put
-from vap_core.base.errors import BadObject, BadOutput, BadStudy
-from vap_core.simulation.assets.scans.mesh_file import count_edge_flaws, weld
+from vap_core.base.errors import BadObject, BadStudy
 from vap_core.simulation.assets.scans.storage import VARIABLE
-from vap_core.simulation.assets.shapes import area_vectors
-from vap_core.simulation.suites import suite
 from vap_core.study import objects as own
 from vap_core.study.objects import (
     Source,
@@ -27,99 +24,20 @@ from vap_core.study.objects import (
     read_source,
     text_report,
 )
-from vap_make.objects.closed_parts import blob, hollow, lathe, ring, tube
-from vap_make.objects.design_paint import LOUD, QUIET, SIDE, draw_colours
-from vap_make.objects.designs import FORMS, HANDLED, draw_design, write_designs
 
 
-def volume(corner: np.ndarray) -> float:
-    return float((corner[:, 0] * area_vectors(corner)).sum() / 6)
-
-
-@pytest.mark.parametrize(
-    ("corner", "wanted"),
-    [
-        (lathe([(0, 0), (0.02, 0), (0.02, 0.05), (0, 0.05)], 4), 2 * 0.02**2 * 0.05),
-        (lathe([(0, 0), (0.02, 0), (0.02, 0.05), (0, 0.05)]), np.pi * 0.02**2 * 0.05),
-        (blob((0, 0, 0), (0.02, 0.03, 0.01)), 4 / 3 * np.pi * 0.02 * 0.03 * 0.01),
-        (tube([(0, 0, 0), (0, 0, 0.02), (0, 0, 0.05)], 0.004), np.pi * 0.004**2 * 0.05),
-    ],
-)
-def test_forms_are_closed_and_have_their_volumes(corner, wanted):
-    assert count_edge_flaws(weld(corner)[1]) == (0, 0)
-    assert volume(corner) == pytest.approx(wanted, rel=0.1)
-
-
-def test_a_vessel_is_its_wall():
-    vessel = hollow([(0.02, 0.0), (0.02, 0.06)], 0.003)
-    solid = lathe([(0, 0), (0.02, 0), (0.02, 0.06), (0, 0.06)])
-    assert count_edge_flaws(weld(vessel)[1]) == (0, 0)
-    assert 0 < volume(vessel) < 0.5 * volume(solid)
-
-
-def test_every_design_of_every_kind_is_closed():
-    rng = np.random.default_rng(0)
-    for forms in FORMS.values():
-        for name, form in forms:
-            for part in form(rng):
-                assert count_edge_flaws(weld(part)[1]) == (0, 0), name
-                assert volume(part) > 0
-            size = np.ptp(np.concatenate(form(rng)), axis=(0, 1))
-            assert (size > 0.015).all(), name
-            assert (size < 0.13).all(), name
-    assert len(ring((0, 0, 0), (0.01, 0.02), 0.001, corners=3)) == 5
-
-
-def test_designs_are_of_tabletops_kinds_half_loud_and_the_same_for_the_same_seed():
-    assert set(FORMS) == {task.category for task in suite("tabletop").tasks}
-    drawn = [draw_design(i, 0) for i in range(24)]
-    assert len({design.name for design in drawn}) == 24
-    assert sum("loud" in design.groups for design in drawn) == 12
-    assert 8 <= sum("with handle" in design.groups for design in drawn) <= 16
-    assert {name for design in drawn for name in design.groups} == {
-        "with handle", "no handle", "loud", "quiet"
-    }  # fmt: skip
-    names = {name for forms in FORMS.values() for name, _ in forms}
-    assert set(HANDLED) <= names
-    assert drawn[0].glb == draw_design(0, 0).glb
-    assert drawn[0].glb != draw_design(0, 1).glb
-
-
-@pytest.mark.parametrize("paint", [*QUIET, *LOUD])
-def test_paint_wraps_twice_and_only_loud_paint_has_many_colours(paint):
-    rng = np.random.default_rng(3)
-    picture = paint(rng, draw_colours(rng))
-    assert picture.shape == (SIDE, 2 * SIDE, 3)
-    assert (picture[:, :SIDE] == picture[:, SIDE:]).all()
-    count = len(np.unique(picture.reshape(-1, 3), axis=0))
-    assert (count <= 2) == (paint in QUIET)
-
-
-def test_the_folder_of_designs_is_read_and_depends_on_all_of_it(tmp_path):
-    write_designs(tmp_path, 3, 0)
+def test_the_folder_is_read_and_depends_on_all_of_it(tmp_path):
+    for name in ("a.glb", "b.glb"):
+        put(tmp_path, name, box(rgb=(200, 60, 30)))
+    (tmp_path / "objects.csv").write_text(
+        "file,category,height_cm,groups\na.glb,cup,6,loud\nb.glb,vase,,quiet\n"
+    )
     source = read_source(tmp_path)
-    assert len(source.groups) == 3
     assert set(source.groups) == set(source.files)
     assert source.sha256 == read_source(tmp_path).sha256
     text = (tmp_path / "objects.csv").read_text()
     (tmp_path / "objects.csv").write_text(text.replace("vase,", "cup,"))
     assert source.sha256 != read_source(tmp_path).sha256
-
-
-def test_designs_replace_no_file_of_anothers(tmp_path):
-    """The same designs again are no error: nothing is lost."""
-    (tmp_path / "objects.csv").write_text("file,category\nmug.glb,cup\n")
-    line = refused("objects", "designs", tmp_path, "--count", "2")
-    assert "objects.csv exists with other contents; choose another folder" in line
-    assert [path.name for path in tmp_path.iterdir()] == ["objects.csv"]
-    assert (tmp_path / "objects.csv").read_text() == "file,category\nmug.glb,cup\n"
-    (tmp_path / "objects.csv").unlink()
-    paths = write_designs(tmp_path, 2, 0)
-    assert write_designs(tmp_path, 2, 0) == paths
-    paths[0].write_bytes(b"mine")
-    with pytest.raises(BadOutput, match="exists with other contents"):
-        write_designs(tmp_path, 2, 0)
-    assert paths[0].read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def eval_objects(
     look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
     goes on.
 
-    Example: python -m vap_core measure objects data/designs
+    Example: python -m vap_core measure objects data/scans
     """
     from vap_core.study.objects import ObjectSurvey, measure_objects
 

@@ -388,27 +388,6 @@ def import_object(
     print(f"next: {line}  # of a suite that asks for a {category}")
 
 
-@objects.command("designs")
-def designs(
-    out: Annotated[Path, typer.Argument(help="Folder for the GLB files and objects.csv.")],
-    count: Annotated[int, typer.Option(min=1, max=200, help="How many.")] = 24,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Another seed is another set, to be held back.")
-    ] = 0,
-) -> None:
-    """Write made-up objects that nothing here was trained on, as 3-D files: with handles and
-    without, plain and loud.
-
-    Example: python -m vap_core objects designs data/designs --seed 1
-    """
-    from vap_core.base.errors import command
-    from vap_make.objects.designs import TABLE, write_designs
-
-    paths = write_designs(out, count, seed)
-    print(f"wrote {len(paths)} designs to {out}, and their kinds to {out / TABLE}")
-    print(f"next: {command('measure', 'objects', out)}")
-
-
 @objects.command("list")
 def list_objects() -> None:
     """Every object there is, your own last.

@@ -1,13 +1,15 @@
 """How the objects of the scenes are drawn: the catalogue, and generic instances for training.
 
 Generic instances draw their motifs and layouts from lists that evaluation instances never use.
-`python -m vap_make.objects` bakes what ships into `data/catalogue`. Importing this package adds
-every generic instance to what `get_object` finds.
+Fixed instances have the parameters that their rows in `data/catalogue/objects.jsonl` have; edit
+those, and bake what ships with `python -m vap_make.objects`. Importing this package adds every
+generic instance to what `get_object` finds.
 """
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -17,13 +19,15 @@ from vap_core.simulation.assets.objects import (
     CATEGORIES,
     CLUTTER,
     MAKERS,
+    OBJECTS,
     RED,
     RED_PAINT,
+    Baked,
     ObjectModel,
 )
 from vap_core.simulation.assets.shapes import Mesh, Solid, Texture
 from vap_make.objects.atlas import render_atlas
-from vap_make.objects.catalogue import FAMILIES, Family
+from vap_make.objects.families import FAMILIES, Family
 from vap_make.objects.generics import draw_texture, draw_twin
 from vap_make.objects.shapes import Shape
 
@@ -48,36 +52,21 @@ class Drawn:
         return render_atlas(self.texture, self.body.aspect())
 
 
-def _model(
-    name: str,
-    family: Family,
-    split: Literal["generic", "personal", "lookalike", "prop"],
-    body: Shape,
-    texture: Texture,
-    mass_kg: float,
-) -> ObjectModel:
+def _spelled(body: Shape) -> dict[str, Any]:
+    """The parameters of a body, as digests of runs spell them."""
     lengths = {part.name: getattr(body, part.name) for part in fields(body)}  # type: ignore[arg-type]
-    shape = {"kind": type(body).__name__, **lengths}
-    return ObjectModel(
-        name, family.category, split, shape, texture, mass_kg, form=Drawn(body, texture)
-    )
+    return {"kind": type(body).__name__, **lengths}
 
 
-def _fixed_objects() -> dict[str, ObjectModel]:
-    """Personal instances, look-alikes and props."""
-    models = []
-    for family in FAMILIES:
-        for i, (body, texture) in enumerate(family.instances):
-            name = f"{family.stem}-lookalike-{i}" if i else f"{family.stem}-personal"
-            split: Literal["personal", "lookalike"] = "lookalike" if i else "personal"
-            models.append(_model(name, family, split, body, texture, family.mass_kg))
-        for body, texture in family.prop:
-            name = f"{family.stem}-prop"
-            models.append(_model(name, family, "prop", body, texture, family.mass_kg))
-    return {model.name: model for model in models}
+def _body(family: Family, shape: Mapping[str, Any]) -> Shape:
+    """The body of a family with the parameters of a row of the catalogue."""
 
+    def tuples(given: Any) -> Any:
+        return tuple(map(tuples, given)) if isinstance(given, list) else given
 
-FIXED: dict[str, ObjectModel] = _fixed_objects()
+    kind: type[Shape] = get_type_hints(family.draw)["return"]
+    names = {part.name for part in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: tuples(given) for name, given in shape.items() if name in names})
 
 
 def family_of(kind: str) -> Family:
@@ -86,6 +75,18 @@ def family_of(kind: str) -> Family:
         if kind in (family.category, family.stem):
             return family
     raise one_of("objects: category", kind, [*CATEGORIES, *CLUTTER])
+
+
+def _drawn(model: ObjectModel) -> ObjectModel:
+    """An object of the catalogue, drawn with its row's parameters."""
+    assert isinstance(model.form, Baked)
+    assert isinstance(model.shape, dict)
+    body = _body(family_of(model.form.stem), model.shape)
+    return replace(model, form=Drawn(body, model.form.texture))
+
+
+FIXED: dict[str, ObjectModel] = {name: _drawn(model) for name, model in OBJECTS.items()}
+"""Personal instances, look-alikes and props: their parameters are the catalogue's rows."""
 
 
 @lru_cache(maxsize=4096)
@@ -109,7 +110,8 @@ def generic_instance(kind: str, index: int, twin: int = 0) -> ObjectModel:
         twin_rng = np.random.default_rng([21, number, index, twin])
         body, texture = draw_twin(family, body, texture, twin_rng)
         name = f"{name}-{twin}"
-    return _model(name, family, "generic", body, texture, mass_kg)
+    shape, form = _spelled(body), Drawn(body, texture)
+    return ObjectModel(name, family.category, "generic", shape, texture, mass_kg, form)
 
 
 def draw(name: str) -> ObjectModel | None:

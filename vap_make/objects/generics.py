@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vap_make.objects.catalogue import Family
-from vap_make.objects.catalogue.sampling import choose
+from vap_make.objects.families import Family, choose
 from vap_make.objects.shapes import Shape
 from vap_make.objects.textures import (
     GENERIC_FILL_LAYOUTS,
