@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from vap_core.simulation.assets import objects, phrases
 from vap_make.films import scenes
-from vap_make.objects import crafts, draw, fabrics, generic_instance, textures
+from vap_make.objects import draw, fabrics, generic_instance, textures
 from vap_make.perception import detector, evaluation, instance_head, segmenter
 from vap_make.perception import train as perception
 
@@ -40,7 +40,7 @@ def test_twins_are_look_alikes_and_found_by_name(kind: str, index: int, number: 
         *textures.GENERIC_GLYPHS,
         *textures.GENERIC_FILLS,
         *fabrics.GENERIC_FABRICS,
-        *crafts.GENERIC_CRAFTS,
+        *fabrics.GENERIC_CRAFTS,
     }
 
 

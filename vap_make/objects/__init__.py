@@ -26,10 +26,10 @@ from vap_core.simulation.assets.objects import (
     ObjectModel,
 )
 from vap_core.simulation.assets.shapes import Mesh, Solid, Texture
-from vap_make.objects.atlas import render_atlas
 from vap_make.objects.families import FAMILIES, Family
 from vap_make.objects.generics import draw_texture, draw_twin
 from vap_make.objects.shapes import Shape
+from vap_make.objects.textures import render_atlas
 
 FAMILY_NUMBERS: dict[str, int] = {family.stem: i for i, family in enumerate(FAMILIES)}
 """Seeds depend on these numbers."""

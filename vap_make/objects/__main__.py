@@ -20,8 +20,7 @@ from vap_core.simulation.assets.objects import FORMS, KEY, RED, ROWS, ObjectMode
 from vap_core.simulation.assets.shapes import Mesh
 from vap_core.simulation.suites.open_row import models_of
 from vap_make.objects import FIXED, Drawn, draw
-from vap_make.objects.atlas import wall_px
-from vap_make.objects.fills import draw_spots
+from vap_make.objects.textures import draw_spots, wall_px
 
 SMALL = {"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 3, "pb": 3}
 """Columns of doubles are a fifth smaller so."""

@@ -9,25 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from vap_core.base.types import value
-from vap_make.objects.bodies.bottles import Bottle, Vase
-from vap_make.objects.bodies.bus import Bus
-from vap_make.objects.bodies.cat import Cat
-from vap_make.objects.bodies.cups import Cup
-from vap_make.objects.bodies.dishes import Basket, Dish
-from vap_make.objects.bodies.disposable_cups import PaperCup, StrawCup
-from vap_make.objects.bodies.gadgets import CameraBody, Can, Shaver
-from vap_make.objects.bodies.house import House
-from vap_make.objects.bodies.leather_bag import LeatherBag
-from vap_make.objects.bodies.owl import Owl
-from vap_make.objects.bodies.painting import Painting
-from vap_make.objects.bodies.pen_holder import PenHolder
-from vap_make.objects.bodies.plants import Plant
-from vap_make.objects.bodies.plushie import Plushie
-from vap_make.objects.bodies.pouch import Pouch
-from vap_make.objects.bodies.scrubber import Scrubber
-from vap_make.objects.bodies.shoe import Shoe
+from vap_make.objects.bodies.animals import Cat, Owl
+from vap_make.objects.bodies.bags import LeatherBag, Pouch
+from vap_make.objects.bodies.bottles import Basket, Bottle, Dish, Vase
+from vap_make.objects.bodies.cups import Cup, PaperCup, PenHolder, StrawCup
+from vap_make.objects.bodies.gadgets import Bus, CameraBody, Can, Shaver
+from vap_make.objects.bodies.ornaments import House, Painting
+from vap_make.objects.bodies.plants import Plant, Scrubber
+from vap_make.objects.bodies.shoes import Shoe
 from vap_make.objects.bodies.slipper import Slipper
-from vap_make.objects.bodies.stuffed_toy import StuffedToy
+from vap_make.objects.bodies.toys import Plushie, StuffedToy
 from vap_make.objects.fabrics import GENERIC_FABRICS
 from vap_make.objects.shapes import Shape
 from vap_make.objects.textures import Srgb, Texture

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from vap_make.objects.bodies.turned import Profile, ellipsoid, lathe
+from vap_make.objects.bodies.parts import Profile, ellipsoid, lathe
 from vap_make.objects.shapes import SIDES, Mesh, Number, Solid, rotation_matrix
 from vap_make.objects.textures import ACCENT, INK, LIGHT
 

@@ -3,8 +3,8 @@
 from typing import Literal
 
 from vap_core.base.types import value
-from vap_make.objects.bodies.shoe_last import Knots, Last
-from vap_make.objects.bodies.turned import ellipsoid
+from vap_make.objects.bodies.parts import ellipsoid
+from vap_make.objects.bodies.shoes import Knots, Last
 from vap_make.objects.shapes import SIDES, Mesh, Solid, join_meshes
 from vap_make.objects.textures import ACCENT, BASE, DARK, DECORATED, INK, SWATCHES
 
