@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import numpy as np
@@ -484,11 +483,3 @@ def test_a_name_that_means_a_checkpoint_is_fitted_to_the_suite(folders, scene):
         BadPolicy, match=r"there is observation.images.head, observation.state \(13\)"
     ):
         load_for_suite(name, scene, replace(suites.suite(SUITE), cameras=("head",)))
-
-
-def test_the_quick_list_of_packages_is_pythons() -> None:
-    from vap_core.policies.lerobot.preload import distributions_of_packages
-
-    quick = {package: sorted(names) for package, names in distributions_of_packages().items()}
-    for package, names in packages_distributions().items():
-        assert quick[package] == sorted(names)

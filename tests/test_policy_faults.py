@@ -100,7 +100,7 @@ def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, messa
         (lambda states, chunks, i: (states, chunks[:-1]), "returned 2 chunks for 3 episodes"),
         (lambda states, chunks, i: (states, [*chunks, chunks[0]]), "returned 4 chunks for 3 ep"),
         (lambda states, chunks, i: (states[1:], chunks), "returned 2 states for 3 episodes"),
-        (lambda states, chunks, i: (states, None), "returned NoneType for the chunks"),
+        (lambda states, chunks, i: (states, None), "returned NoneType chunks for 3 episodes"),
         (with_chunk(None), "returned NoneType as a chunk; return a NumPy array"),
         (with_chunk([[0.0] * 7]), "returned list as a chunk"),
         (with_chunk(np.float32(1)), "returned float32 as a chunk"),

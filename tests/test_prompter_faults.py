@@ -83,9 +83,9 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda all_, i: all_[:i] + all_[i + 1 :], "0 results for 1 episode; return one for each"),
-        (lambda all_, i: [*all_, all_[i]], "2 results for 1 episode; return one for each"),
-        (lambda all_, i: None, "NoneType; return a list, one result per episode"),
+        (lambda all_, i: all_[:i] + all_[i + 1 :], "0 results for 1 episode; return a list"),
+        (lambda all_, i: [*all_, all_[i]], "2 results for 1 episode; return a list"),
+        (lambda all_, i: None, "NoneType results for 1 episode; return a list"),
         (lambda all_, i: [*all_[:i], 7, *all_[i + 1 :]], "int as a result; return the state and"),
         (
             lambda all_, i: [*all_[:i], (2, None), *all_[i + 1 :]],
@@ -137,7 +137,7 @@ def test_a_prompter_cannot_write_into_what_it_is_given(trial: Trial) -> None:
 
 
 def test_the_number_of_episodes_is_in_the_message() -> None:
-    line = "prompter Faulty: steps returned 0 results for 2 episodes; return one for each"
+    line = "prompter Faulty: steps returned 0 results for 2 episodes; return a list, one for each"
     with pytest.raises(ValueError, match=line):
         checked_steps([], Faulty(lambda results, i: results), 2)
 

@@ -9,29 +9,21 @@ small ones that ship. Files are parsed, never executed, and no more than a block
 
 import json
 import re
-import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from vap_core.base.errors import BadPolicy
+from vap_core.base.errors import BadPolicy, first_line
 from vap_core.base.files import parse_json
 
 INPUT = re.compile(r"(.*\.)?(language|text)_model\.(model\.)?embed_tokens\.weight")
 """The table that the decoder reads, by every name that lerobot and transformers give it."""
 TIED = re.compile(r"(.*\.)?(paligemma\.|language_model\.)lm_head\.weight|lm_head\.weight")
 """The same table under its output's name: a file with tied weights may hold this one alone."""
-TYPES: dict[str, np.dtype[Any]] = {
-    "F32": np.dtype("<f4"),
-    "F16": np.dtype("<f2"),
-    "BF16": np.dtype("<u2"),
-}
-LONGEST_HEADER = 100_000_000
-"""Bytes; safetensors' own limit."""
+TYPES = ("F32", "F16", "BF16")
 
 
 @dataclass(frozen=True)
@@ -40,25 +32,14 @@ class EmbeddingTable:
 
     file: Path
     name: str
-    kind: str
     shape: tuple[int, int]
-    offset: int
 
     def block(self, start: int, stop: int) -> Float32[np.ndarray, "r d"]:
         """Rows `start` to `stop`, without the last."""
-        stored = TYPES[self.kind]
-        rows, width = self.shape
-        start, stop, _ = slice(start, stop).indices(rows)
-        mapped = np.memmap(
-            self.file,
-            dtype=stored,
-            mode="r",
-            offset=self.offset + start * width * stored.itemsize,
-            shape=(stop - start, width),
-        )
-        if self.kind == "BF16":
-            return (mapped.astype(np.uint32) << 16).view(np.float32)
-        return np.array(mapped, np.float32)
+        from safetensors import safe_open
+
+        with safe_open(self.file, "pt") as stored:
+            return stored.get_slice(self.name)[start : min(stop, self.shape[0])].float().numpy()
 
     def rows(self) -> Float32[np.ndarray, "v d"]:
         """The whole table."""
@@ -79,69 +60,35 @@ def open_table(folder: Path) -> EmbeddingTable:
 
     Raises: BadPolicy when there is none, or when a file is damaged.
     """
-    tied = None
+    from safetensors import SafetensorError, safe_open
+
+    found: dict[re.Pattern[str], tuple[Path, str, str, list[int]]] = {}
     for file in sorted(folder.glob("*.safetensors")):
-        for name, about in _header(file).items():
-            if INPUT.fullmatch(name):
-                return _table(file, name, about)
-            if TIED.fullmatch(name):
-                tied = (file, name, about)
-    if tied is None:
+        try:
+            with safe_open(file, "np") as stored:
+                for name in list(stored.keys()):
+                    for pattern in (INPUT, TIED):
+                        if pattern.fullmatch(name):
+                            part = stored.get_slice(name)
+                            about = file, name, part.get_dtype(), part.get_shape()
+                            found.setdefault(pattern, about)
+        except (OSError, SafetensorError) as error:
+            raise BadPolicy(
+                f"embeddings: {file} is damaged ({first_line(error):.120}); copy or download it "
+                "again."
+            ) from error
+    if not found:
         raise BadPolicy(
             f"embeddings: {folder} holds no table of word embeddings; give the folder of a "
             "PaliGemma, pi0, pi0.5 or mini-pi0 in safetensors."
         )
-    return _table(*tied)
-
-
-def _header(file: Path) -> dict[str, Mapping[str, Any]]:
-    """What a safetensors file says of its tensors, by name. Raises: BadPolicy."""
-    try:
-        with file.open("rb") as stream:
-            (length,) = struct.unpack("<Q", stream.read(8))
-            if length > LONGEST_HEADER:
-                raise ValueError("its header is too long")
-            header = parse_json(stream.read(length))
-        header.pop("__metadata__", None)
-        for about in header.values():
-            begin, end = about["data_offsets"]
-            if begin < 0:
-                raise ValueError("a tensor lies before the data")
-            about["data_offsets"] = (8 + length + begin, 8 + length + end)
-    except (OSError, struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise _damaged(file, type(error).__name__) from error
-    return header
-
-
-def _table(file: Path, name: str, about: Mapping[str, Any]) -> EmbeddingTable:
-    """The table that a header describes. Raises: BadPolicy when the file does not hold it."""
-    kind = about.get("dtype")
-    if kind not in TYPES:
+    file, name, kind, shape = found.get(INPUT) or found[TIED]
+    if kind not in TYPES or len(shape) != 2 or 0 in shape:
         raise BadPolicy(
-            f"embeddings: {name} in {file} is stored as {kind}; save it as one of "
-            f"{', '.join(TYPES)}."
+            f"embeddings: {name} in {file} is {kind} of {tuple(shape)}; save it as rows and "
+            f"columns of one of {', '.join(TYPES)}."
         )
-    rows, width = _size(about.get("shape"))
-    begin, end = about["data_offsets"]
-    if rows * width == 0 or end - begin != rows * width * TYPES[kind].itemsize:
-        raise _damaged(file, f"{name} does not have the bytes of its shape")
-    if end > file.stat().st_size:
-        raise _damaged(file, f"it ends before {name} does")
-    return EmbeddingTable(file=file, name=name, kind=kind, shape=(rows, width), offset=begin)
-
-
-def _size(shape: Any) -> tuple[int, int]:
-    """Rows and columns; zeros when it is not two positive whole numbers."""
-    if not isinstance(shape, list) or len(shape) != 2:
-        return 0, 0
-    for size in shape:
-        if not isinstance(size, int) or size <= 0:
-            return 0, 0
-    return shape[0], shape[1]
-
-
-def _damaged(file: Path, reason: str) -> BadPolicy:
-    return BadPolicy(f"embeddings: {file} is damaged ({reason:.120}); copy or download it again.")
+    return EmbeddingTable(file, name, (shape[0], shape[1]))
 
 
 RESERVED = re.compile(r"<(my_|unused|loc|seg)\d+>")
@@ -164,9 +111,7 @@ def token_groups(
         if found is None:
             continue
         vocabulary, encode = found
-        used: set[int] = set()
-        for text in texts:
-            used |= set(encode(text))
+        used = {token for text in texts for token in encode(text)}
         reserved = [token for word, token in vocabulary.items() if RESERVED.fullmatch(word)]
         groups = {"words": sorted(used), "reserved": sorted(reserved)}
         return {name: np.array(tokens, np.int64) for name, tokens in groups.items() if tokens}
@@ -186,35 +131,27 @@ def vocabulary_of(folder: Path) -> tuple[dict[str, int], Encode] | None:
             f"embeddings: {config} is no configuration ({type(error).__name__}); save it again."
         ) from error
     if words:
-        vocabulary = {word: token for token, word in enumerate(words)}
+        known = {word: token for token, word in enumerate(words)}
+        return known, lambda text: [known[word] for word in words_of(text) if word in known]
+    for file in (folder / name for name in TOKENIZERS):
+        if file.is_file():
+            from tokenizers import Tokenizer
 
-        def encode_words(text: str) -> list[int]:
-            return [vocabulary[word] for word in words_of(text) if word in vocabulary]
+            try:
+                tokenizer = Tokenizer.from_str(json.dumps(parse_json(file.read_text())))
+            except Exception as error:  # the library raises no narrower kind
+                raise BadPolicy(
+                    f"embeddings: {file} is no tokenizer ({type(error).__name__}); download it "
+                    "again."
+                ) from error
 
-        return vocabulary, encode_words
-    for name in TOKENIZERS:
-        if (folder / name).is_file():
-            return _tokenizer(folder / name)
+            def encode(text: str, of: Tokenizer = tokenizer) -> list[int]:
+                return of.encode(text, add_special_tokens=False).ids
+
+            return tokenizer.get_vocab(with_added_tokens=True), encode
     return None
 
 
 def words_of(text: str) -> list[str]:
     """The words of a text as a small model reads them, in lower case."""
     return re.findall(r"<\w+>|[\w']+", text.lower())
-
-
-def _tokenizer(file: Path) -> tuple[dict[str, int], Encode]:
-    """A tokenizer file, which is parsed, not executed. Raises: BadPolicy."""
-    from tokenizers import Tokenizer
-
-    try:
-        tokenizer = Tokenizer.from_str(json.dumps(parse_json(file.read_text())))
-    except Exception as error:  # the library raises no narrower kind
-        raise BadPolicy(
-            f"embeddings: {file} is no tokenizer ({type(error).__name__}); download it again."
-        ) from error
-
-    def encode(text: str) -> list[int]:
-        return tokenizer.encode(text, add_special_tokens=False).ids
-
-    return tokenizer.get_vocab(with_added_tokens=True), encode

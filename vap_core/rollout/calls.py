@@ -47,7 +47,15 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
         not above 0, or outside the main thread, where no handler runs.
     """
     check_limit(limit_s)
-    note = threading.Timer(NOTE_AFTER_S, _note_waiting, [episodes])
+    note = threading.Timer(
+        NOTE_AFTER_S,
+        lambda: print(
+            f"note: the policy has not answered for {NOTE_AFTER_S:.0f} s; waiting: "
+            f"{', '.join(episodes)}; --policy-timeout SECONDS ends such a call.",
+            file=sys.stderr,
+            flush=True,
+        ),
+    )
     note.daemon = True
     note.start()
     try:
@@ -103,17 +111,15 @@ def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[
             f"{label}: plan returned {type(returned).__name__}; return two lists, of states and of "
             "chunks."
         )
-    states, chunks = returned
-    for name, parts in (("states", states), ("chunks", chunks)):
-        if not isinstance(parts, list | tuple | np.ndarray):
+    for name, parts in zip(("states", "chunks"), returned, strict=True):
+        is_list = isinstance(parts, list | tuple | np.ndarray)
+        if not is_list or len(parts) != n:
+            what = len(parts) if is_list else type(parts).__name__
             raise BadPlan(
-                f"{label}: plan returned {type(parts).__name__} for the {name}; return a list."
+                f"{label}: plan returned {what} {name} for {n} episodes; return a list, one for "
+                "each."
             )
-        if len(parts) != n:
-            raise BadPlan(
-                f"{label}: plan returned {len(parts)} {name} for {n} episodes; return one for each."
-            )
-    return list(states), list(chunks)
+    return list(returned[0]), list(returned[1])
 
 
 def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[str]) -> None:
@@ -122,8 +128,7 @@ def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[st
     for chunk in chunks:
         found = type(chunk).__name__
         if isinstance(chunk, np.ndarray):
-            fits = chunk.ndim == 2 and len(chunk) > 0 and chunk.shape[1] == size
-            if fits and chunk.dtype == np.float32:
+            if chunk.shape[1:] == (size,) and len(chunk) and chunk.dtype == np.float32:
                 continue
             found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
         raise BadPlan(
@@ -158,18 +163,7 @@ def _timer(limit_s: float | None) -> Iterator[None]:
             signal.signal(signal.SIGALRM, handler)
 
 
-def _note_waiting(episodes: Sequence[str]) -> None:
-    print(
-        f"note: the policy has not answered for {NOTE_AFTER_S:.0f} s; waiting: "
-        f"{', '.join(episodes)}; --policy-timeout SECONDS ends such a call.",
-        file=sys.stderr,
-        flush=True,
-    )
-
-
-TOKEN = "token"
-COLOUR = "colour"
-CATEGORY = "category"
+TOKEN, COLOUR, CATEGORY = "token", "colour", "category"
 QUERIES = (TOKEN, COLOUR, CATEGORY, ACTION)
 ALL = "all"
 
@@ -184,12 +178,11 @@ def only_queries(
     maps: Mapping[str, Mapping[str, AttentionMap]], wanted: Sequence[str]
 ) -> dict[str, dict[str, AttentionMap]]:
     """The maps of the wanted queries, by camera; empty where the text has none of them."""
-    kept: dict[str, dict[str, AttentionMap]] = {}
-    for camera, of_queries in maps.items():
-        for query, heat in of_queries.items():
-            if query in wanted:
-                kept.setdefault(camera, {})[query] = heat
-    return kept
+    kept = {
+        camera: {query: heat for query, heat in of_queries.items() if query in wanted}
+        for camera, of_queries in maps.items()
+    }
+    return {camera: of_queries for camera, of_queries in kept.items() if of_queries}
 
 
 def named_queries(names: Sequence[str]) -> tuple[str, ...]:
@@ -200,9 +193,7 @@ def named_queries(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in (*QUERIES, ALL):
             raise one_of("--attention: query", name, [*QUERIES, ALL])
-    if ALL in names:
-        return QUERIES
-    return tuple(query for query in QUERIES if query in names)
+    return tuple(query for query in QUERIES if query in names or ALL in names)
 
 
 Digests = tuple[Mapping[str, str], Mapping[str, str]]
@@ -242,19 +233,9 @@ def compare(
     found = []
     for name, digest in of_prompted.items():
         if name == TEXT:
-            pixels = 0
-            changed = prompted.text != raw.text
+            pixels, changed = 0, prompted.text != raw.text
         else:
-            differs = (prompted.images[name] != raw.images[name]).any(axis=2)
-            pixels = int(differs.sum())
-            changed = bool(differs.any())
-        consumed = ConsumedInput(
-            step=step,
-            name=name,
-            changed=changed,
-            pixels=pixels,
-            consumed=digest,
-            raw=of_raw[name],
-        )
-        found.append(consumed)
+            pixels = int((prompted.images[name] != raw.images[name]).any(axis=2).sum())
+            changed = pixels > 0
+        found.append(ConsumedInput(step, name, changed, pixels, digest, of_raw[name]))
     return found

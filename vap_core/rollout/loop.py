@@ -195,11 +195,11 @@ def _observe_and_prompt(
         if observation is not None:
             observations[id(episode)] = observation
 
-    following = []
-    for episode in live:
-        observation = observations.get(id(episode))
-        if episode.prompting and observation is not None and observation.images:
-            following.append(episode)
+    following = [
+        episode
+        for episode in live
+        if episode.prompting and id(episode) in observations and observations[id(episode)].images
+    ]
     prompted = _prompt_batch(trial, following, observations)
 
     steps: dict[int, Step] = {}
@@ -222,24 +222,20 @@ def _observe_and_prompt(
 
 
 def _observe(trial: Trial, episode: RunningEpisode) -> Observation:
-    if _takes_images(trial, episode):
-        return episode.env.observe()
-    return Observation({}, episode.env.state())
+    """This control step's observation, with pictures where they are wanted.
 
-
-def _takes_images(trial: Trial, episode: RunningEpisode) -> bool:
-    """Whether this control step renders.
-
-    The first always does; the others when the policy is called, or every step is wanted.
+    The first step always has them; the others when the policy is called, or every step is wanted.
     """
+    steps = episode.judge.steps
     if episode.homing is not None:
-        return episode.keeps_images
-    if isinstance(trial.policy, PrivilegedPolicy):
+        sees = episode.keeps_images
+    elif isinstance(trial.policy, PrivilegedPolicy):
         every = trial.images_every
-        return episode.keeps_images or bool(every and episode.judge.steps % every == 0)
-    if trial.follow == "step" or episode.header is None:
-        return True
-    return not episode.queue or episode.over
+        sees = episode.keeps_images or bool(every and steps % every == 0)
+    else:
+        sees = trial.follow == "step" or episode.header is None
+        sees = sees or not episode.queue or episode.over
+    return episode.env.observe() if sees else Observation({}, episode.env.state())
 
 
 def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observation) -> Attended:
@@ -267,17 +263,19 @@ def _prompt_batch(
         return {}
     start = time.perf_counter()
     try:
-        results = _call_prompter(trial, following, observations)
+        states = [episode.prompter_state for episode in following]
+        shown = [_shown(observations[id(episode)]) for episode in following]
+        contexts = [_context(trial, episode) for episode in following]
+        returned = trial.prompter.steps(states, shown, contexts)
+        results = checked_steps(returned, trial.prompter, len(following))
     except (Exception, SystemExit) as error:
         if _ends_the_run(error):
             raise
         if len(following) == 1:
             _fail(following[0])
             return {}
-        one_by_one: dict[int, Attended] = {}
-        for episode in following:
-            one_by_one |= _prompt_batch(trial, [episode], observations)
-        return one_by_one
+        alone = [_prompt_batch(trial, [episode], observations) for episode in following]
+        return {key: attended for one in alone for key, attended in one.items()}
     share = (time.perf_counter() - start) / len(following)
     attended = {}
     for episode, (state, of_episode) in zip(following, results, strict=True):
@@ -285,22 +283,6 @@ def _prompt_batch(
         episode.seconds["attend"] += share
         attended[id(episode)] = of_episode
     return attended
-
-
-def _call_prompter(
-    trial: Trial,
-    following: Sequence[RunningEpisode],
-    observations: dict[int, Observation],
-) -> list[tuple[Any, Attended]]:
-    states = []
-    images = []
-    contexts = []
-    for episode in following:
-        states.append(episode.prompter_state)
-        images.append(_shown(observations[id(episode)]))
-        contexts.append(_context(trial, episode))
-    returned = trial.prompter.steps(states, images, contexts)
-    return checked_steps(returned, trial.prompter, len(following))
 
 
 def _shown(observation: Observation) -> Observation:
@@ -378,7 +360,10 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
         return
     start = time.perf_counter()
     try:
-        with policy_call(trial.policy_timeout_s, [_named(trial, episode) for episode in calling]):
+        rows = [episode.row for episode in calling]
+        names = [f"{r.suite} {r.task} episode {r.episode} seed {r.seed}" for r in rows]
+        names = [f"{name} ({trial.method})" for name in names]
+        with policy_call(trial.policy_timeout_s, names):
             states, chunks = _call_policy(trial, calling, steps)
         check_chunks(chunks, trial.policy.label, calling[0].env.action_names)
     except Exception as error:
@@ -398,11 +383,6 @@ def _plan(trial: Trial, live: Sequence[RunningEpisode], steps: dict[int, Step]) 
         episode.seconds["policy"] += share
 
 
-def _named(trial: Trial, episode: RunningEpisode) -> str:
-    row = episode.row
-    return f"{row.suite} {row.task} episode {row.episode} seed {row.seed} ({trial.method})"
-
-
 def _call_policy(
     trial: Trial, calling: Sequence[RunningEpisode], steps: dict[int, Step]
 ) -> tuple[list[Any], list[Any]]:
@@ -415,10 +395,11 @@ def _call_policy(
     raw = []
     prompted = []
     for episode in calling:
-        observation, attended = steps[id(episode)]
-        state = observation.state
-        raw.append(_policy_input(observation.images, episode.goal.instruction, state))
-        prompted.append(_policy_input(attended.images, attended.text, state))
+        seen, attended = steps[id(episode)]
+        # It cannot write: the recording shows what the prompter made.
+        state = _read_only(seen.state)
+        raw.append(PolicyInput(_locked(seen.images), episode.goal.instruction, state))
+        prompted.append(PolicyInput(_locked(attended.images), attended.text, state))
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
@@ -435,11 +416,6 @@ def _call_policy(
     for i, episode in enumerate(calling):
         episode.attention = only_queries(maps.get(i, {}), trial.attention)
     return after, chunks
-
-
-def _policy_input(images: Views, text: str, state: np.ndarray) -> PolicyInput:
-    """What the policy reads. It cannot write: the recording shows what the prompter made."""
-    return PolicyInput(_locked(images), text, _read_only(state))
 
 
 def _locked(images: Views) -> Views:
@@ -490,7 +466,13 @@ def _act(
         subgoal=subgoal_number(episode),
     )
     if episode.over:
-        episode.outcome = ending(episode, detail=_note_on_actions(episode))
+        note = ""
+        if episode.beyond:  # a line for the results table
+            note = (
+                f"{episode.beyond} of {episode.judge.steps} actions asked for over {BEYOND} times "
+                "the robot's speed and were cut to it; check the policy's units."
+            )
+        episode.outcome = ending(episode, detail=note)
     episode.attention = {}
     episode.notes = []
     with _timed(episode.seconds, "record"):
@@ -501,16 +483,6 @@ def _act(
         episode.env.step(action)
         episode.beyond += episode.env.is_beyond_limits(action)
         episode.judge = episode.judge.step(episode.env.truth())
-
-
-def _note_on_actions(episode: RunningEpisode) -> str:
-    """A line for the results table where the policy asked for what the robot cannot do."""
-    if not episode.beyond:
-        return ""
-    return (
-        f"{episode.beyond} of {episode.judge.steps} actions asked for over {BEYOND} times the "
-        "robot's speed and were cut to it; check the policy's units."
-    )
 
 
 def _end(trial: Trial, episode: RunningEpisode) -> Episode:

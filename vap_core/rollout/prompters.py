@@ -102,11 +102,10 @@ def checked_steps(returned: object, prompter: object, n: int) -> list[tuple[Any,
     Raises: ValueError when it is not a list of one state and one Attended for each episode.
     """
     who = f"prompter {type(prompter).__name__}: steps returned"
-    if not isinstance(returned, list | tuple):
-        raise ValueError(f"{who} {type(returned).__name__}; return a list, one result per episode")
-    if len(returned) != n:
+    if not isinstance(returned, list | tuple) or len(returned) != n:
+        what = len(returned) if isinstance(returned, list | tuple) else type(returned).__name__
         episodes = "1 episode" if n == 1 else f"{n} episodes"
-        raise ValueError(f"{who} {len(returned)} results for {episodes}; return one for each")
+        raise ValueError(f"{who} {what} results for {episodes}; return a list, one for each")
     for result in returned:
         is_pair = isinstance(result, list | tuple) and len(result) == 2
         if not is_pair or not isinstance(result[1], Attended):
@@ -118,9 +117,7 @@ def checked_steps(returned: object, prompter: object, n: int) -> list[tuple[Any,
 
 def unchanged(images: Views, text: str) -> Attended:
     """Images as they are, with `text`."""
-    return Attended(
-        images=images, text=text, colours=(), tracks={}, groundings={}, events=(), associations=()
-    )
+    return Attended(images, text, (), {}, {}, (), ())
 
 
 @dataclass(frozen=True)
@@ -185,11 +182,7 @@ def generic() -> TextPrompter:
 
 def say(text: str) -> TextPrompter:
     """Raw images and `text`, whatever the instruction is."""
-
-    def replace_all(instruction: str) -> str:
-        return text
-
-    return TextPrompter(replace_all)
+    return TextPrompter(lambda instruction: text)
 
 
 def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
@@ -205,11 +198,8 @@ def hard_prompt(obj: PersonalObject, how: HardPrompt) -> TextPrompter:
             "delete its file."
         )
     phrase = obj.description.short if how.length == "short" else obj.description.long
-
-    def append(instruction: str) -> str:
-        return f"{instruction.rstrip(' .')}. My {obj.category} is {phrase}."
-
-    return TextPrompter(append)
+    said = f". My {obj.category} is {phrase}."
+    return TextPrompter(lambda instruction: instruction.rstrip(" .") + said)
 
 
 def soft_prompt(word: str, categories: Collection[str] = ()) -> TextPrompter:
@@ -274,7 +264,7 @@ class Oracle:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-class OraclePrompter:
+class OraclePrompter(TintPrompter):
     """An Attender whose grounding is the simulator's.
 
     `alike` are the scene's objects of the target's category. Every visible object of the category
@@ -283,19 +273,10 @@ class OraclePrompter:
     """
 
     def __init__(self, attender: Attender, oracle: Oracle, alike: frozenset[str]) -> None:
-        self.attender = attender
+        super().__init__(attender)
         self.oracle = oracle
         self.alike = alike
-        every_step = oracle.reveal == "track"
-        self.needs_truth: Literal["never", "start", "always"] = "always" if every_step else "start"
-
-    @property
-    def highlights(self) -> bool:
-        return self.attender.prompting.highlight
-
-    @property
-    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
-        return self.attender.references
+        self.needs_truth = "always" if oracle.reveal == "track" else "start"
 
     def prompted_object(self, row: EpisodeRow) -> str:
         """The object that is prompted. Raises: BadStudy when the episode places no look-alike."""
@@ -329,9 +310,12 @@ class OraclePrompter:
         candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, tuple[Grounding, ...]] = {}
         for camera, rgb in observation.images.items():
-            visible = self._visible(truth.masks[camera])
-            masks = list(visible.values())
-            found = self._describe(rgb, phrase, masks)
+            visible = {
+                name: mask
+                for name, mask in truth.masks[camera].items()
+                if name in self.alike and mask.any()
+            }
+            found = self._describe(rgb, phrase, list(visible.values()))
             elected = self.attender.ground(camera, wanted[0], found)
             choice = list(visible).index(prompted) if prompted in visible else None
             candidates[camera] = (found,)
@@ -351,8 +335,7 @@ class OraclePrompter:
         contexts: Sequence[PromptContext],
     ) -> list[tuple[AttendState, Attended]]:
         if self.needs_truth == "start":
-            views = [observation.images for observation in observations]
-            return self.attender.steps(states, views)
+            return super().steps(states, observations, contexts)
         results = []
         for state, observation, context in zip(states, observations, contexts, strict=True):
             truth = _truth(context)
@@ -362,13 +345,10 @@ class OraclePrompter:
                 mask = truth.masks[camera].get(prompted)
                 if mask is not None:
                     mask = spoil(mask, self.oracle.area, self.oracle.shift)
-                tracks[camera] = (_track(mask),)
+                seen = mask is not None and bool(mask.any())
+                tracks[camera] = (Track(mask, 1.0) if seen else Track(None, 0.0),)
             results.append(self.attender.follow(state, observation.images, tracks, state.trackers))
         return results
-
-    def _visible(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
-        """The visible objects of the category, by name."""
-        return {name: mask for name, mask in masks.items() if name in self.alike and mask.any()}
 
     def _describe(self, rgb: Rgb, phrase: str, masks: Sequence[Mask]) -> Candidates:
         """The candidates of one view: true boxes, and true masks.
@@ -376,16 +356,14 @@ class OraclePrompter:
         The masks are the segmenter's where only the boxes are revealed.
         """
         xyxy = np.array([mask_box(mask) for mask in masks], np.float32).reshape(-1, 4)
-        scores = np.ones(len(xyxy), np.float32)
-        boxes = Boxes(xyxy, scores, phrase)
+        boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), phrase)
         if self.oracle.reveal == "box":
             drawn = self.attender.stack.segmenter(rgb, boxes)
         else:
             spoiled = [spoil(mask, self.oracle.area, self.oracle.shift) for mask in masks]
             drawn = np.array(spoiled, bool).reshape(-1, *rgb.shape[:2])
         embeddings = self.attender.stack.encoder([crop(rgb, box) for box in xyxy])
-        ids = tuple(range(len(xyxy)))
-        return Candidates(boxes=boxes, embeddings=embeddings, masks=drawn, ids=ids)
+        return Candidates(boxes, embeddings, drawn, tuple(range(len(xyxy))))
 
 
 def spoil(mask: Mask, area: float, shift: float) -> Mask:
@@ -407,12 +385,6 @@ def spoil(mask: Mask, area: float, shift: float) -> Mask:
 def _truth(context: PromptContext) -> SceneTruth:
     assert context.truth is not None, "a prompter that needs truth is given it"
     return context.truth
-
-
-def _track(mask: Mask | None) -> Track:
-    if mask is None or not mask.any():
-        return Track(None, 0.0)
-    return Track(mask, 1.0)
 
 
 EARLY = 0.1
@@ -445,21 +417,13 @@ class SwitchPrompter:
         self.switch = switch
         self.before = OraclePrompter(attender, Oracle("track"), alike)
         self.after = OraclePrompter(attender, Oracle("track", of="look-alike"), alike)
-
-    @property
-    def highlights(self) -> bool:
-        return self.before.highlights
-
-    @property
-    def references(self) -> Mapping[str, tuple[Rgb, ...]]:
-        return self.before.references
+        self.highlights, self.references = self.before.highlights, self.before.references
 
     def start(
         self, observation: Observation, context: PromptContext
     ) -> tuple[SwitchState, Attended]:
         """Prompt the target. Raises: BadStudy when the episode places no look-alike of it."""
-        assert context.truth is not None, "a prompter that needs truth is given it"
-        self.after.prompted_object(context.truth.row)
+        self.after.prompted_object(_truth(context).row)
         state, attended = self.before.start(observation, context)
         return SwitchState(state, switched=False), attended
 
@@ -471,18 +435,17 @@ class SwitchPrompter:
     ) -> list[tuple[SwitchState, Attended]]:
         results = []
         for state, observation, context in zip(states, observations, contexts, strict=True):
-            assert context.truth is not None, "a prompter that needs truth is given it"
-            switched = state.switched or self._is_time(context.truth)
+            truth = _truth(context)
+            if self.switch.when == "early":
+                due = truth.step >= EARLY * truth.row.max_steps
+            else:
+                due = truth.row.target in truth.moved
+            switched = state.switched or due
             oracle = self.after if switched else self.before
             ((attend, attended),) = oracle.steps([state.attend], [observation], [context])
             if switched and not state.switched:
-                name = self.after.prompted_object(context.truth.row)
-                event = Event(context.truth.step, "WARN", f"{SWITCHED}{name}")
+                name = self.after.prompted_object(truth.row)
+                event = Event(truth.step, "WARN", f"{SWITCHED}{name}")
                 attended = replace(attended, events=(event, *attended.events))
             results.append((SwitchState(attend, switched), attended))
         return results
-
-    def _is_time(self, truth: SceneTruth) -> bool:
-        if self.switch.when == "early":
-            return truth.step >= EARLY * truth.row.max_steps
-        return truth.row.target in truth.moved

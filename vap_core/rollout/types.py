@@ -133,6 +133,14 @@ class SubGoalSpan:
     first: int
 
 
+OF_ROW = ("suite", "task", "split", "variant", "episode", "seed")
+OF_OUTCOME = (
+    *("success", "success_once", "held_steps", "cmr"),
+    *("wrong_object", "first_object_correct", "touched"),
+)
+"""Columns of a results table that are fields of an episode's row, and of its outcome."""
+
+
 @value
 class Episode:
     """A finished episode.
@@ -165,58 +173,35 @@ class Episode:
         return row.suite, row.task, self.header.method, row.seed, row.episode
 
     def summary(self) -> dict[str, Any]:
-        """One flat row of a results table."""
-        row = self.header.row
-        outcome = self.outcome
-        timings = {f"seconds_{part}": seconds for part, seconds in self.seconds.items()}
+        """One flat row of a results table.
+
+        `margin` is the least of all votes that had a candidate: 0 where no view had one, None where
+        no vote was held. `subgoals_done` counts those that succeeded, `subgoal_1` says whether the
+        first did.
+        """
+        row, outcome = self.header.row, self.outcome
+        ballots = [
+            grounding.ballot for of_view in self.header.groundings.values() for grounding in of_view
+        ]
+        held = [ballot.margin for ballot in ballots if ballot.winner is not None]
+        columns: dict[str, Any] = {}
+        if row.subgoals:
+            ended = [part.success for part in outcome.subgoals]
+            ended += [False] * (row.stages - len(ended))
+            columns["subgoals_done"] = sum(ended)
+            columns |= {f"subgoal_{i + 1}": done for i, done in enumerate(ended)}
         return {
-            "suite": row.suite,
-            "task": row.task,
-            "split": row.split,
-            "variant": row.variant,
-            "episode": row.episode,
-            "seed": row.seed,
+            **{name: getattr(row, name) for name in OF_ROW},
             "method": self.header.method,
             "policy": self.header.policy,
             "outcome": outcome.status,
-            "success": outcome.success,
-            "success_once": outcome.success_once,
-            "held_steps": outcome.held_steps,
-            "cmr": outcome.cmr,
-            "wrong_object": outcome.wrong_object,
-            "first_object_correct": outcome.first_object_correct,
-            "touched": outcome.touched,
+            **{name: getattr(outcome, name) for name in OF_OUTCOME},
             "steps": outcome.steps,
-            "margin": self._least_margin(),
+            "margin": min(held, default=0.0) if ballots else None,
             "detail": outcome.detail,
-            **self._subgoal_columns(),
-            **timings,
+            **columns,
+            **{f"seconds_{part}": seconds for part, seconds in self.seconds.items()},
         }
-
-    def _least_margin(self) -> float | None:
-        """The least margin of all votes that had a candidate.
-
-        0 where no view had one, None where no vote was held.
-        """
-        ballots = []
-        for per_view in self.header.groundings.values():
-            ballots += [grounding.ballot for grounding in per_view]
-        if not ballots:
-            return None
-        held = [ballot.margin for ballot in ballots if ballot.winner is not None]
-        return min(held, default=0.0)
-
-    def _subgoal_columns(self) -> dict[str, Any]:
-        """`subgoals_done` counts those that succeeded, `subgoal_1` says whether the first did."""
-        if not self.header.row.subgoals:
-            return {}
-        columns: dict[str, Any] = {}
-        done = 0
-        for i in range(self.header.row.stages):
-            ended = self.outcome.subgoals[i : i + 1]
-            columns[f"subgoal_{i + 1}"] = bool(ended) and ended[0].success
-            done += columns[f"subgoal_{i + 1}"]
-        return {"subgoals_done": done, **columns}
 
 
 type Case = Literal["case 1", "case 2", "case 3", "unprompted", "unlabelled"]
@@ -350,14 +335,8 @@ def mask_coverage(
         groundings = attended.groundings.get(camera, ())
         if opening and groundings and true is not None and pixels:
             proposal = best_proposal(groundings[0], true)
-        coverage = MaskCoverage(
-            camera=camera,
-            object=covered_object(mask, masks),
-            iou=overlap,
-            pixels=pixels,
-            proposal=proposal,
-        )
-        found.append(coverage)
+        covered = covered_object(mask, masks)
+        found.append(MaskCoverage(camera, covered, overlap, pixels, proposal))
     return tuple(found)
 
 
@@ -368,16 +347,9 @@ def covered_object(mask: Mask | None, masks: Mapping[str, Mask]) -> str | None:
     """
     if mask is None or not mask.any():
         return None
-    best = ""
-    most = 0
-    for name, of_object in masks.items():
-        pixels = int((mask & of_object).sum())
-        if pixels > most:
-            best = name
-            most = pixels
-    if most >= MAJORITY * int(mask.sum()):
-        return best
-    return ""
+    pixels = {name: int((mask & of_object).sum()) for name, of_object in masks.items()}
+    best = max(pixels, key=lambda name: pixels[name], default="")
+    return best if best and pixels[best] >= MAJORITY * int(mask.sum()) else ""
 
 
 def best_proposal(grounding: Grounding, true: Mask) -> float:
@@ -385,5 +357,4 @@ def best_proposal(grounding: Grounding, true: Mask) -> float:
     box = mask_box(true)
     if box is None or not len(grounding.candidates):
         return 0.0
-    overlap = box_iou(grounding.candidates.xyxy, box[None])
-    return float(np.max(overlap))
+    return float(box_iou(grounding.candidates.xyxy, box[None]).max())

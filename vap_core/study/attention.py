@@ -268,7 +268,7 @@ def run_replay(
     with store.locked(folder):
         paths = {job.name: folder / "parts" / f"{job.name}.json" for job in jobs}
         missing = [job for job in jobs if not paths[job.name].exists()]
-        prepare(("vap_core.study.attention", "vap_core.policies.lerobot.preload"))
+        prepare(("vap_core.study.attention", "lerobot.policies"))
         n, left = (sum(len(job.rows) for job in each) for each in (jobs, missing))
         with tqdm(
             total=n, initial=n - left, unit="episode", desc="attention", disable=not progress

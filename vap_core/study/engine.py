@@ -127,7 +127,7 @@ def worker_modules(policy: str) -> tuple[str, ...]:
     modules = (
         *modules,
         "vap_core.policies.lerobot.adapter",
-        "vap_core.policies.lerobot.preload",
+        "lerobot.policies",
     )
     if Path(policy).name.startswith(MINI):
         return (*modules, "vap_core.policies.mini_pi0.processor_mini_pi0")

@@ -110,17 +110,15 @@ class LeRobot:
         self.batched = not remembers and not ensembles and (self.noisy or draws_nothing)
         self.execute = int(config.n_action_steps) if self.batched else 1
         self.action_size = int(config.action_feature.shape[0])
-        # The key that the preprocessor expects, by the key to which it renames it.
-        renamed = {}
-        for step in preprocessor.steps:
-            for old, new in getattr(step, "rename_map", {}).items():
-                renamed[new] = old
-        self.renamed = renamed
-        self.wanted: Shapes = {}
+        maps = [getattr(step, "rename_map", {}) for step in preprocessor.steps]
+        self.renamed = {new: old for names in maps for old, new in names.items()}
+        """The key that the preprocessor expects, by the key to which it renames it."""
+        self.wanted: Shapes = {
+            self.renamed.get(key, key): tuple(feature.shape)
+            for key, feature in config.input_features.items()
+            if not key.startswith(EMPTY)
+        }
         """Shape of every feature that is read, under the key that the preprocessor expects."""
-        for key, feature in config.input_features.items():
-            if not key.startswith(EMPTY):
-                self.wanted[self.renamed.get(key, key)] = tuple(feature.shape)
         self.learned: dict[int, torch.Tensor] = {}
         """The learned embedding of a word, by its token."""
         self.attends = self.batched and can_watch(policy)
@@ -184,14 +182,23 @@ class LeRobot:
         Raises: BadPolicy when the inputs do not fit.
         """
         if self.batched:
-            return list(states), self._plan_batch(states, inputs)
+            batch, noise = self.prepare(states, inputs)
+            self._report_inputs(batch, range(len(inputs)))
+            with overriding_tokens(self.policy, self.learned), self._watching(batch):
+                planned = self.predict(batch, noise)
+            actions = self.postprocessor(planned[:, : self.execute])
+            return list(states), list(actions.float().cpu().numpy())
         self.predict.stay_eager("it has a memory, which is no input of its calls")
-        after: list[LeRobotState] = []
+        # Copies remember this call, so that one that fails can be made again.
+        after = copy.deepcopy(list(states))
         chunks: list[Chunk] = []
-        for i, (state, policy_input) in enumerate(zip(states, inputs, strict=True)):
-            # A copy remembers this call, so that one that fails can be made again.
-            after.append(copy.deepcopy(state))
-            chunks.append(self._plan_step(i, after[i], policy_input))
+        for i, (state, policy_input) in enumerate(zip(after, inputs, strict=True)):
+            batch = self.preprocessor(self._observation([policy_input]))
+            self._report_inputs(batch, [i])
+            with torch.random.fork_rng():
+                torch.manual_seed(state.seed)
+                action = self.postprocessor(state.own.select_action(batch))
+            chunks.append(action.float().cpu().numpy())
         return after, chunks
 
     def check(self, cameras: Sequence[str], state_size: int, action_size: int) -> None:
@@ -200,9 +207,7 @@ class LeRobot:
         Raises: BadPolicy when it reads another camera or another state, or when its actions have
             another length.
         """
-        available: Shapes = {STATE: (state_size,)}
-        for camera in cameras:
-            available[IMAGE + camera] = ()
+        available: Shapes = {STATE: (state_size,)} | {IMAGE + camera: () for camera in cameras}
         for key, shape in self.wanted.items():
             if key not in available or (key == STATE and shape != available[key]):
                 raise BadPolicy(
@@ -219,8 +224,7 @@ class LeRobot:
     def cameras(self) -> list[str]:
         """The names of our cameras, in the order in which the policy reads them."""
         config: Any = self.policy.config
-        keys = [key for key in config.image_features if not key.startswith(EMPTY)]
-        return [self._camera(key) for key in keys]
+        return [self._camera(key) for key in config.image_features if not key.startswith(EMPTY)]
 
     def prepare(
         self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
@@ -236,16 +240,6 @@ class LeRobot:
         """Checksum of all parameters and buffers as they stand."""
         return state_sha256(self.policy)
 
-    def _plan_batch(
-        self, states: Sequence[LeRobotState], inputs: Sequence[PolicyInput]
-    ) -> list[Chunk]:
-        batch, noise = self.prepare(states, inputs)
-        self._report_inputs(batch, range(len(inputs)))
-        with overriding_tokens(self.policy, self.learned), self._watching(batch):
-            planned = self.predict(batch, noise)
-        actions = self.postprocessor(planned[:, : self.execute])
-        return list(actions.float().cpu().numpy())
-
     def _watching(self, batch: dict[str, Any]) -> AbstractContextManager[None]:
         """Reports the attention of a call where somebody observes it."""
         if not self.attends or not attention_observed():
@@ -256,14 +250,6 @@ class LeRobot:
         ]
         return reporting_attention(self.policy, self.cameras(), places)
 
-    def _plan_step(self, episode: int, state: LeRobotState, policy_input: PolicyInput) -> Chunk:
-        batch = self.preprocessor(self._observation([policy_input]))
-        self._report_inputs(batch, [episode])
-        with torch.random.fork_rng():
-            torch.manual_seed(state.seed)
-            action = self.postprocessor(state.own.select_action(batch))
-        return action.float().cpu().numpy()
-
     def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
         """What lerobot's loop would hand to the preprocessor.
 
@@ -273,13 +259,16 @@ class LeRobot:
         observation: dict[str, Any] = {"task": [policy_input.text for policy_input in inputs]}
         for key, shape in self.wanted.items():
             if key == STATE:
-                state = np.stack([policy_input.state for policy_input in inputs])
-                observation[key] = torch.from_numpy(state)
+                observation[key] = torch.from_numpy(np.stack([each.state for each in inputs]))
             else:
                 camera = key.removeprefix(IMAGE)
                 rgb = np.stack([policy_input.images[camera] for policy_input in inputs])
                 images = torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 255
-                observation[key] = _resize(images, shape)
+                if images.shape[-2:] != shape[-2:]:  # as large as the checkpoint was trained on
+                    images = torch.nn.functional.interpolate(
+                        images, shape[-2:], mode="bilinear", antialias=True
+                    )
+                observation[key] = images
         return observation
 
     def _report_inputs(self, batch: dict[str, Any], episodes: Sequence[int]) -> None:
@@ -310,10 +299,8 @@ class LeRobot:
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
         config: Any = self.policy.config
         shape = (config.chunk_size, config.max_action_dim)
-        noise = []
-        for state in states:
-            generator = torch.Generator().manual_seed(state.seed)
-            noise.append(torch.randn(shape, generator=generator))
+        seeded = [torch.Generator().manual_seed(state.seed) for state in states]
+        noise = [torch.randn(shape, generator=generator) for generator in seeded]
         return torch.stack(noise).to(config.device)
 
 
@@ -339,12 +326,7 @@ def load_policy(
                 "sampling noise is scaled by one."
             )
         config.temperature = temperature
-    return LeRobot(
-        policy=policy,
-        preprocessor=preprocessor,
-        postprocessor=postprocessor,
-        label=label_of(checkpoint, temperature),
-    )
+    return LeRobot(policy, preprocessor, postprocessor, label_of(checkpoint, temperature))
 
 
 _loaded: dict[tuple[str, float | None], tuple[object, LeRobot]] = {}
@@ -360,7 +342,6 @@ def load_for_suite(
 
     Raises: BadPolicy, as `load_policy`, and when it does not fit them.
     """
-    # The checkpoint as its files are now. Raises: BadPolicy, as `load_policy`.
     key = (checkpoint, temperature)
     now = stamp(checkpoint)
     if key in _loaded and _loaded[key][0] != now:
@@ -370,8 +351,7 @@ def load_for_suite(
         _loaded[key] = (now, load_policy(checkpoint, temperature=temperature))
     policy = _loaded[key][1]
     env = Env(scene, control=suite.control)
-    state_size = len(env.state())
-    policy.check(suite.cameras, state_size, env.action_size)
+    policy.check(suite.cameras, len(env.state()), env.action_size)
     return policy
 
 
@@ -383,14 +363,6 @@ def _copy_policy(policy: "PreTrainedPolicy") -> "PreTrainedPolicy":
         if not shared:
             setattr(own, name, copy.deepcopy(attribute))
     return own
-
-
-def _resize(images: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
-    """Scaled to the height and width that the checkpoint was trained on."""
-    size = shape[-2:]
-    if images.shape[-2:] == size:
-        return images
-    return torch.nn.functional.interpolate(images, size, mode="bilinear", antialias=True)
 
 
 def _format_shapes(features: Shapes) -> str:

@@ -41,9 +41,7 @@ def local_folder(checkpoint: str | Path) -> Path | None:
 
 def is_checkpoint_name(policy: str) -> bool:
     """Whether a policy's name means a checkpoint: a folder that exists, or owner/name."""
-    if local_folder(policy) is not None:
-        return True
-    return re.fullmatch(r"[\w.-]+/[\w.-]+", policy) is not None
+    return local_folder(policy) is not None or bool(re.fullmatch(r"[\w.-]+/[\w.-]+", policy))
 
 
 def locate(checkpoint: str | Path) -> Path:
@@ -94,11 +92,7 @@ def base_models(folder: Path) -> list[str]:
         config = step.get("config")
         if isinstance(config, dict):
             names.append(str(config.get("tokenizer_name", "")))
-    found: list[str] = []
-    for name in names:
-        if name and name not in found and not Path(name).is_dir():
-            found.append(name)
-    return found
+    return [name for name in dict.fromkeys(names) if name and not Path(name).is_dir()]
 
 
 def fingerprint(checkpoint: str | Path) -> str:
@@ -141,15 +135,21 @@ def refuse_code(folder: Path) -> None:
 
     Raises: BadPolicy for another step, or for a checkpoint with VAP attached.
     """
+    from lerobot.processor import ProcessorStep
+
     for file in PIPELINES:
         for step in _steps(folder / file):
             name = str(step.get("class", ""))
+            module, _, attribute = name.rpartition(".")
+            found = getattr(sys.modules.get(module), attribute, None)  # nothing is imported
+            ours = isinstance(found, type) and issubclass(found, ProcessorStep)
             if is_vap_step(step):
                 raise BadPolicy(
                     f"load: {folder} has VAP attached for lerobot's own loops; here give the plain "
                     "checkpoint, and the method by --method."
                 )
-            if step.get("registry_name") is None and not _is_lerobot_step(name):
+            ours = ours and module.startswith("lerobot.processor")
+            if step.get("registry_name") is None and not ours:
                 raise BadPolicy(
                     f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; "
                     "files are parsed here, never executed."
@@ -176,24 +176,13 @@ def _deciding_files(folder: Path) -> list[Path]:
     found = []
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder)
-        if file.is_file() and _decides(name) and not _is_beside(folder, name):
+        inner = list(name.parents)[:-1]
+        # In a hidden folder, as what a killed save leaves, or in a run's.
+        beside = any(part.name.startswith(".") or (folder / part / RUN).is_file() for part in inner)
+        beside |= name.name in (TRAINING_CARD, RECIPE) or name.parts[0] in (CAPTIONS, WORDS)
+        if file.is_file() and not beside and any(map(name.match, WANTED_FILES)):
             found.append(name)
     return found
-
-
-def _is_beside(folder: Path, name: Path) -> bool:
-    """Whether a file is in a hidden folder, as what a killed save leaves, or in a run's."""
-    for inner in list(name.parents)[:-1]:
-        if inner.name.startswith(".") or (folder / inner / RUN).is_file():
-            return True
-    return False
-
-
-def _decides(name: Path) -> bool:
-    """Whether a file of a checkpoint, by its name in the folder, decides what it does."""
-    if name.name in (TRAINING_CARD, RECIPE) or name.parts[0] in (CAPTIONS, WORDS):
-        return False
-    return any(name.match(pattern) for pattern in WANTED_FILES)
 
 
 def _steps(file: Path) -> list[dict[str, Any]]:
@@ -206,14 +195,3 @@ def _steps(file: Path) -> list[dict[str, Any]]:
             f"load: {file} is no processor pipeline ({type(error).__name__}); save it again with "
             "lerobot 0.6."
         ) from error
-
-
-def _is_lerobot_step(name: str) -> bool:
-    """Whether a step is one of lerobot's. Nothing that the file names is imported for that."""
-    from lerobot.processor import ProcessorStep
-
-    module, _, attribute = name.rpartition(".")
-    if not module.startswith("lerobot.processor"):
-        return False
-    found = getattr(sys.modules.get(module), attribute, None)
-    return isinstance(found, type) and issubclass(found, ProcessorStep)

@@ -64,23 +64,20 @@ class Recorded:
         found = hashlib.sha256()
         try:
             for part in PARTS:
-                for path in sorted((self.folder / part).rglob("*")):
+                for path in filter(Path.is_file, sorted((self.folder / part).rglob("*"))):
+                    about = path.stat()
+                    what = f"{about.st_size} {about.st_mtime_ns}"
+                    what = sha256_of(path) if part == "meta" else what
                     name = path.relative_to(self.folder).as_posix()
-                    if part == "meta" and path.is_file():
-                        found.update(f"{name} {sha256_of(path)}\n".encode())
-                    elif path.is_file():
-                        about = path.stat()
-                        found.update(f"{name} {about.st_size} {about.st_mtime_ns}\n".encode())
+                    found.update(f"{name} {what}\n".encode())
         except OSError as error:
             raise _damaged(self.folder, error) from error
         return found.hexdigest()[:16]
 
     def tasks(self, episodes: int) -> tuple[str, ...]:
         """The tasks of the first `episodes` episodes, each once, in their order."""
-        found: dict[str, None] = {}
-        for episode in range(episodes):
-            found |= dict.fromkeys(map(str, self.dataset.meta.episodes[episode]["tasks"]))
-        return tuple(found)
+        of_episodes = [self.dataset.meta.episodes[i]["tasks"] for i in range(episodes)]
+        return tuple(dict.fromkeys(str(task) for tasks in of_episodes for task in tasks))
 
     def frames(self, episode: int) -> Iterator[RecordedFrame]:
         """The frames of an episode, in order. Raises: BadDataset."""
@@ -92,13 +89,7 @@ class Recorded:
             except Exception as error:  # decoders of damaged files raise anything
                 raise _damaged(self.folder, error) from error
             views = {camera: _rgb(item[key]) for camera, key in self.keys.items()}
-            yield RecordedFrame(
-                number=number,
-                at_s=number / self.hz,
-                views=views,
-                task=str(item["task"]),
-                item=item,
-            )
+            yield RecordedFrame(number, number / self.hz, views, str(item["task"]), item)
 
 
 def open_dataset(folder: Path) -> Recorded:
@@ -126,13 +117,7 @@ def open_dataset(folder: Path) -> Recorded:
     if not keys or not n_episodes:
         what = "episode" if keys else "colour picture"
         raise BadDataset(f"dataset: {folder} has no {what}; record one with lerobot-record.")
-    return Recorded(
-        folder=folder,
-        dataset=dataset,
-        keys=keys,
-        hz=float(dataset.meta.fps),
-        episodes=n_episodes,
-    )
+    return Recorded(folder, dataset, keys, float(dataset.meta.fps), n_episodes)
 
 
 class Copy:
@@ -156,23 +141,18 @@ class Copy:
         self._stage = out.with_name(f".{out.name}.partial")
         self._source = source
         meta = source.dataset.meta
-        self._features = {}
-        for key, feature in meta.features.items():
-            if key not in DEFAULT_FEATURES:
-                self._features[key] = {**feature, "shape": tuple(feature["shape"])}
+        self._features = {
+            key: {**feature, "shape": tuple(feature["shape"])}
+            for key, feature in meta.features.items()
+            if key not in DEFAULT_FEATURES
+        }
         described = dict(self._features)
         self._masks = {}
         for camera, key in source.keys.items() if masks else ():
-            # Of a picture's shape, whose channels come first or last.
-            shape = self._features[key]["shape"]
-            height, width = [
-                side
-                for i, side in enumerate(shape)
-                if i != (0 if shape[0] == 3 and shape[-1] != 3 else len(shape) - 1)
-            ]
-            height_width = height, width
-            feature = {"dtype": "uint8", "shape": height_width, "names": ["height", "width"]}
-            self._masks[camera] = height_width
+            shape = list(self._features[key]["shape"])
+            shape.pop(0 if shape[0] == 3 and shape[-1] != 3 else -1)  # the channels
+            self._masks[camera] = tuple(shape)
+            feature = {"dtype": "uint8", "shape": tuple(shape), "names": ["height", "width"]}
             described[MASK + camera] = feature
         shutil.rmtree(self._stage, ignore_errors=True)
         try:
@@ -212,9 +192,13 @@ class Copy:
         """
         copied: dict[str, Any] = {"task": task}
         for key, feature in self._features.items():
-            copied[key] = _as_stored(frame.item[key], feature)
-        for camera, key in self._source.keys.items():
-            copied[key] = views[camera]
+            cell = frame.item[key]
+            if feature["dtype"] in ("image", "video"):
+                cell = np.asarray(cell).transpose(1, 2, 0)
+            elif feature["dtype"] != "string" and not isinstance(cell, str):
+                cell = np.asarray(cell).astype(feature["dtype"]).reshape(feature["shape"])
+            copied[key] = cell
+        copied |= {key: views[camera] for camera, key in self._source.keys.items()}
         for camera, shape in self._masks.items():
             mask = masks[camera]
             copied[MASK + camera] = np.zeros(shape, np.uint8) if mask is None else mask.astype("u1")
@@ -253,7 +237,11 @@ def _cameras(dataset: "LeRobotDataset", folder: Path) -> dict[str, str]:
     for key, feature in dataset.meta.features.items():
         is_picture = feature["dtype"] in ("image", "video")
         if is_picture and key not in dataset.meta.depth_keys and 3 in feature["shape"]:
-            camera = _camera(key)
+            camera = key
+            for prefix in PREFIXES:
+                if key.startswith(prefix):
+                    camera = key.removeprefix(prefix)
+                    break
             if camera in keys:
                 raise BadDataset(
                     f"dataset: {folder} has pictures {keys[camera]} and {key}, which are both of a "
@@ -263,30 +251,12 @@ def _cameras(dataset: "LeRobotDataset", folder: Path) -> dict[str, str]:
     return keys
 
 
-def _camera(key: str) -> str:
-    """The name of the camera that a feature's pictures are from."""
-    for prefix in PREFIXES:
-        if key.startswith(prefix):
-            return key.removeprefix(prefix)
-    return key
-
-
 def _rgb(picture: Any) -> Rgb:
     """lerobot's C x H x W tensor as H x W x 3 bytes."""
     levels = picture.numpy()
     if levels.dtype != np.uint8:
         levels = np.clip(np.rint(levels * 255), 0, 255).astype(np.uint8)
     return np.ascontiguousarray(levels.transpose(1, 2, 0))
-
-
-def _as_stored(cell: Any, feature: Mapping[str, Any]) -> Any:
-    """A cell that was read, as `add_frame` takes it."""
-    if feature["dtype"] == "string" or isinstance(cell, str):
-        return cell
-    array = np.asarray(cell)
-    if feature["dtype"] in ("image", "video"):
-        return array.transpose(1, 2, 0)
-    return array.astype(feature["dtype"]).reshape(feature["shape"])
 
 
 def _damaged(folder: Path, error: Exception) -> BadDataset:

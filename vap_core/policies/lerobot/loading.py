@@ -5,7 +5,7 @@ lerobot's normaliser returns a tensor unchanged where its key has no statistics.
 
 import io
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from importlib import import_module
 from pathlib import Path
@@ -31,16 +31,15 @@ NEEDED = {
 EMPTY = "observation.images.empty_camera"
 """What the keys of empty cameras begin with; a checkpoint fills them itself, unscaled."""
 ACTION = "action"
-Scaled = tuple[Any, str, Any]
-"""A step that scales, the key of what it scales, and the feature of that key."""
 
 
-def _inputs(config: Any, preprocessor: Any) -> Iterator[Scaled]:
-    """What the normalisers of a preprocessor scale. An action is no input, and goes through none.
+def _scaled(config: Any, preprocessor: Any, postprocessor: Any) -> Iterator[tuple[Any, str, Any]]:
+    """Every step that scales, the key of what it scales, and the feature of that key.
 
-    From the last step back, as a step that renames follows the key that it renames.
+    Inputs go from the last step back, as a step that renames follows the key that it renames. An
+    action is no input; it goes through the unnormalisers alone.
     """
-    from lerobot.processor import NormalizerProcessorStep
+    from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 
     features = {
         key: feature for key, feature in config.input_features.items() if not key.startswith(EMPTY)
@@ -53,12 +52,6 @@ def _inputs(config: Any, preprocessor: Any) -> Iterator[Scaled]:
                     yield step, key, feature
         before = {new: old for old, new in getattr(step, "rename_map", {}).items()}
         features = {before.get(key, key): feature for key, feature in features.items()}
-
-
-def _actions(config: Any, postprocessor: Any) -> Iterator[Scaled]:
-    """What the unnormalisers of a postprocessor scale: the actions alone."""
-    from lerobot.processor import UnnormalizerProcessorStep
-
     for step in postprocessor.steps:
         if isinstance(step, UnnormalizerProcessorStep):
             yield step, ACTION, config.action_feature
@@ -77,19 +70,13 @@ def _fault(step: Any, key: str, feature: Any) -> str:
         found = statistics.get(f"{key}.{name}")
         if found is None or not is_scaled:
             return f"no statistics of {key}"
-        if not _fits(tuple(found.shape), shape):
+        try:  # those of an image may be of its channels alone
+            wide = tuple(torch.broadcast_shapes(found.shape, shape)) if len(shape) > 1 else None
+        except RuntimeError:
+            wide = None
+        if shape not in (tuple(found.shape), wide):
             return f"statistics of {key} for {found.numel()} numbers, where it has {shape[0]}"
     return ""
-
-
-def _fits(found: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether statistics have the shape of a vector; an image's may be of its channels alone."""
-    if len(shape) == 1:
-        return found == shape
-    try:
-        return tuple(torch.broadcast_shapes(found, shape)) == shape
-    except RuntimeError:
-        return False
 
 
 def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, Any]:
@@ -106,13 +93,15 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
     try:
         policy, preprocessor, postprocessor = _build(folder, device)
     except Exception as error:
-        remedy = _remedy(folder, error)
+        remedy = "check its files, or save it again with lerobot 0.6"
+        models = base_models(folder) if "huggingface.co" in str(error) else []
+        if models:
+            remedy = f"get what it builds on: {', '.join(f'`hf download {m}`' for m in models)}"
         raise BadPolicy(
             f"load: {folder} cannot become a policy "
             f"({type(error).__name__}: {first_line(error):.200}); {remedy}."
         ) from error
-    scaled = (*_inputs(policy.config, preprocessor), *_actions(policy.config, postprocessor))
-    for step, key, feature in scaled:
+    for step, key, feature in _scaled(policy.config, preprocessor, postprocessor):
         fault = _fault(step, key, feature)
         if fault:
             raise BadPolicy(f"load: {folder} has {fault}; save it with the dataset's statistics.")
@@ -135,15 +124,25 @@ def compare(policy: "PreTrainedPolicy", file: Path) -> None:
     different = []
     tied = set()
     with safe_open(file, "pt") as stored:
-        names = _names_in_file(policy, stored.keys(), weights)
+        in_file = list(stored.keys())
+        # openpi's names are mapped by the policy itself; numbers stand in for the tensors.
+        numbered = {name: torch.tensor(i) for i, name in enumerate(in_file)}
+        rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+        if rename is not None:
+            numbered = rename(numbered, policy.config)
+        names = {
+            key if key in weights else f"model.{key}": in_file[int(number)]
+            for key, number in numbered.items()
+        }
         for key, name in names.items():
-            if key in weights and _equal(stored.get_tensor(name), weights[key]):
+            found = stored.get_tensor(name) if key in weights else None
+            if found is not None and torch.equal(found.to(weights[key].dtype), weights[key].cpu()):
                 tied.add(weights[key].data_ptr())
             else:
                 different.append(key)
-    for key, tensor in weights.items():
-        if key not in names and tensor.data_ptr() not in tied:
-            different.append(key)
+    different += [
+        key for key, tensor in weights.items() if key not in names and tensor.data_ptr() not in tied
+    ]
     if different:
         raise BadPolicy(
             f"load: {len(different)} of {len(weights)} tensors differ from {file}, {different[0]} "
@@ -176,39 +175,6 @@ def _build(folder: Path, device: str) -> tuple["PreTrainedPolicy", Any, Any]:
             preprocessor_overrides={"device_processor": {"device": config.device}},
         )
     return policy, preprocessor, postprocessor
-
-
-def _remedy(folder: Path, error: Exception) -> str:
-    """What to do about a checkpoint that cannot be built."""
-    if "huggingface.co" in str(error):
-        models = base_models(folder)
-        if models:
-            commands = ", ".join(f"`hf download {name}`" for name in models)
-            return f"get what it builds on: {commands}"
-    return "check its files, or save it again with lerobot 0.6"
-
-
-def _names_in_file(
-    policy: "PreTrainedPolicy", names: Sequence[str], weights: Mapping[str, torch.Tensor]
-) -> dict[str, str]:
-    """The name of a tensor in the file, by its key in the policy's `weights`.
-
-    openpi's names are mapped by the policy itself; numbers stand in for the tensors meanwhile.
-    """
-    numbered = {name: torch.tensor(i) for i, name in enumerate(names)}
-    rename: Callable[..., dict[str, Any]] | None
-    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if rename is not None:
-        numbered = rename(numbered, policy.config)
-    found = {}
-    for key, number in numbered.items():
-        known = key if key in weights else f"model.{key}"
-        found[known] = names[int(number)]
-    return found
-
-
-def _equal(stored: torch.Tensor, loaded: torch.Tensor) -> bool:
-    return torch.equal(stored.to(loaded.dtype), loaded.cpu())
 
 
 @contextmanager

@@ -15,7 +15,7 @@ commands find all this.
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -49,7 +49,6 @@ from vap_core.policies.lerobot.checkpoints import (
 from vap_core.prompt import Tint
 from vap_core.simulation import suites
 from vap_core.simulation.gym_env import VapEnv, env_id
-from vap_core.simulation.types import EpisodeRow
 
 IMAGES = "observation.images."
 STEP = "observation.vap_step"
@@ -126,8 +125,7 @@ class VapPrompt(ProcessorStep):
                 "shuffled; train the plain checkpoint."
             )
         task = extra.get("task")
-        _check_names(observation, is_batched=not isinstance(task, str))
-        views = _views(observation)
+        views = _views(observation, is_batched=not isinstance(task, str))
         if not views or task is None:
             missing = "task" if views else f"{IMAGES}*"
             raise BadViews(
@@ -157,7 +155,14 @@ class VapPrompt(ProcessorStep):
 
     def _steps(self, signal: torch.Tensor | None, n: int) -> list[int]:
         """The step that every environment of the batch is at, 0 for a new episode."""
-        numbered = [] if signal is None else _whole_numbers(signal)
+        given = [] if signal is None else signal.reshape(-1).tolist()
+        for step in given:
+            if not (step >= 0 and float(step).is_integer()):
+                raise BadViews(
+                    f"VapPrompt: {STEP} is {step:g}; give the whole number of steps since the "
+                    "episode began (0 = new)."
+                )
+        numbered = list(map(int, given))
         if self.episodes == "vap_step" or (self.episodes == "auto" and numbered):
             if not numbered:
                 raise BadViews(
@@ -198,7 +203,10 @@ class VapPrompt(ProcessorStep):
                     f"VapPrompt: {key} is of {len(batch)} environments, but there are {len(texts)} "
                     f"tasks and {len(steps)} steps; give one of each per environment."
                 )
-            pixels[key.removeprefix(IMAGES)] = _pixels(batch)
+            # lerobot's floats in 0..1, B x C x H x W, as the RGB bytes that they were.
+            levels = (batch.detach().cpu().float() * 255).round().clamp(0, 255).to(torch.uint8)
+            rgb = np.ascontiguousarray(levels.permute(0, 2, 3, 1).numpy())
+            pixels[key.removeprefix(IMAGES)] = rgb
             prompted[key] = tensor.clone()
         new_texts = []
         for i, (step, text) in enumerate(zip(steps, texts, strict=True)):
@@ -207,11 +215,11 @@ class VapPrompt(ProcessorStep):
             self._ongoing[i] = episode
             new_texts.append(episode.text)
             for camera, rgb in episode.images.items():
-                if rgb is images[camera] or not (rgb != images[camera]).any():
-                    continue
                 batch = prompted[IMAGES + camera]
                 tensor = batch if batch.ndim == 3 else batch[i]
                 changed = torch.from_numpy((rgb != images[camera]).any(-1)).to(tensor.device)
+                if not changed.any():
+                    continue
                 new = (torch.from_numpy(rgb).permute(2, 0, 1).float() / 255).to(tensor)
                 tensor[:, changed] = new[:, changed]
         return prompted, new_texts
@@ -253,10 +261,8 @@ class VapPrompt(ProcessorStep):
         if self._attender is None:
             stack = load_stack(self.stack)
             memory = load_bank(Path(self.memory), stack.encoder.name)
-            prompting = Prompting(
-                form=Tint(self.alpha), highlight=self.highlight, rewrite=self.rewrite
-            )
-            self._attender = Attender(stack, memory, prompting, speaker=self.speaker)
+            how = Prompting(form=Tint(self.alpha), highlight=self.highlight, rewrite=self.rewrite)
+            self._attender = Attender(stack, memory, how, speaker=self.speaker)
         return self._attender
 
 
@@ -287,7 +293,9 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     file = source / PIPELINES[0]
     try:
         pipeline = parse_json(file.read_text())
-        place = _place_of_step(pipeline["steps"])
+        # Behind the renaming of observations, else first.
+        names = [step.get("registry_name") for step in pipeline["steps"]]
+        place = names.index(RENAMING_STEP) + 1 if RENAMING_STEP in names else 0
         attached = any(map(is_vap_step, pipeline["steps"]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadPolicy(
@@ -339,7 +347,10 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.inner = VapEnv(suite, task, image_size, robots, render_mode="rgb_array")
         self.render_mode = "rgb_array"
         self.metadata = {**self.inner.metadata, "render_fps": round(self.inner.suite.hz)}
-        self.rows = _shorten(self.inner.rows, max_steps)
+        self.rows = [
+            row if max_steps is None else replace(row, max_steps=min(row.max_steps, max_steps))
+            for row in self.inner.rows
+        ]
         self.task = env_id(suite, task)
         self.task_description = self.rows[0].instruction
         self._max_episode_steps = max(row.max_steps for row in self.rows)
@@ -358,9 +369,7 @@ class LeRobotEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
-        number = seed
-        if number is None:
-            number = int(self.np_random.integers(len(self.rows)))
+        number = int(self.np_random.integers(len(self.rows))) if seed is None else seed
         row = self.rows[number % len(self.rows)]
         self.task_description = row.instruction
         observation, info = self.inner.reset(options={"row": row})
@@ -422,10 +431,12 @@ class VapEnvConfig(EnvConfig):
 
         An environment whose episode is over stands still, as in lerobot's own.
         """
-        envs = {
-            i: self._vector_env(task, n_envs, use_async_envs) for i, task in enumerate(self.tasks)
+        tasks = enumerate(self.tasks)
+        return {
+            self.suite.name: {
+                i: self._vector_env(task, n_envs, use_async_envs) for i, task in tasks
+            }
         }
-        return {self.suite.name: envs}
 
     def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> Any:
         def make_env() -> gymnasium.Env:
@@ -438,90 +449,49 @@ class VapEnvConfig(EnvConfig):
         return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.NEXT_STEP)
 
 
-def _views(observation: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    """The images of an observation, by their key; those of depth are left out. Raises: BadViews."""
+def _views(observation: Mapping[str, Any], is_batched: bool) -> dict[str, torch.Tensor]:
+    """The images of an observation, by their key; those of depth are left out.
+
+    Raises: BadViews: one is not as lerobot's pictures are, or a colour picture has a name under
+        which it would not be prompted.
+    """
     views = {}
     for key, picture in observation.items():
-        if key.startswith(IMAGES) and not (
-            "depth" in key and tuple(np.shape(picture))[-3:-2] == (1,)
-        ):
-            _check_picture(key, picture)
-            views[key] = picture
+        shape = tuple(np.shape(picture)) if hasattr(picture, "shape") else ()
+        if not key.startswith(IMAGES):
+            # The last states of three environments have three dimensions, too, so that a picture
+            # of a batch has four.
+            if (len(shape) == 4 or (len(shape) == 3 and not is_batched)) and (
+                shape[-3] == 3 or ("image" in key and shape[-1] == 3)
+            ):
+                raise BadViews(
+                    f"VapPrompt: {key} is a colour picture, and {IMAGES}* alone are prompted; map "
+                    f"its name to {IMAGES}... by rename_map in the checkpoint's {PIPELINES[0]}, or "
+                    "leave it out."
+                )
+            continue
+        if "depth" in key and shape[-3:-2] == (1,):
+            continue
+        fits = isinstance(picture, torch.Tensor) and picture.is_floating_point()
+        if not fits or len(shape) not in (3, 4) or shape[-3] != 3 or not picture.numel():
+            kind = f"{type(picture).__name__} {getattr(picture, 'dtype', '')}".strip()
+            raise BadViews(
+                f"VapPrompt: {key} is {kind} of {tuple(np.shape(picture))}; give a tensor of "
+                "floats in 0..1, 3 x height x width, or a batch of them."
+            )
+        if not torch.isfinite(picture).all():
+            raise BadViews(
+                f"VapPrompt: {key} has numbers that are not finite; mend the camera, or skip the "
+                "frame."
+            )
+        low, high = picture.min().item(), picture.max().item()
+        if low < -SLACK or high > 1 + SLACK:
+            raise BadViews(
+                f"VapPrompt: {key} has numbers from {low:g} to {high:g}; give floats in 0..1, and "
+                "let the normaliser come after this step."
+            )
+        views[key] = picture
     return views
-
-
-def _whole_numbers(signal: torch.Tensor) -> list[int]:
-    """The steps that environments give. Raises: BadViews: one is no whole number from 0 on."""
-    steps = signal.reshape(-1).tolist()
-    for step in steps:
-        if not (step >= 0 and float(step).is_integer()):
-            raise BadViews(
-                f"VapPrompt: {STEP} is {step:g}; give the whole number of steps since the episode "
-                "began (0 = new)."
-            )
-    return list(map(int, steps))
-
-
-def _check_names(observation: Mapping[str, Any], is_batched: bool) -> None:
-    """Raises: BadViews: a colour picture has a name under which it would not be prompted."""
-    for key, entry in observation.items():
-        if not key.startswith(IMAGES) and _is_picture(key, entry, is_batched):
-            raise BadViews(
-                f"VapPrompt: {key} is a colour picture, and {IMAGES}* alone are prompted; map its "
-                f"name to {IMAGES}... by rename_map in the checkpoint's {PIPELINES[0]}, or leave "
-                "it out."
-            )
-
-
-def _is_picture(key: str, entry: Any, is_batched: bool) -> bool:
-    """Whether an entry has the shape of a colour picture.
-
-    The last states of three environments have three dimensions, too, so that a picture of a batch
-    has four.
-    """
-    shape = tuple(getattr(entry, "shape", ()))
-    if len(shape) != 4 and (is_batched or len(shape) != 3):
-        return False
-    return shape[-3] == 3 or ("image" in key and shape[-1] == 3)
-
-
-def _check_picture(key: str, picture: Any) -> None:
-    """Raises: BadViews: it is not as lerobot's pictures are."""
-    fits = isinstance(picture, torch.Tensor) and picture.is_floating_point()
-    if not fits or picture.ndim not in (3, 4) or picture.shape[-3] != 3 or not picture.numel():
-        kind = f"{type(picture).__name__} {getattr(picture, 'dtype', '')}".strip()
-        raise BadViews(
-            f"VapPrompt: {key} is {kind} of {tuple(np.shape(picture))}; give a tensor of floats in "
-            "0..1, 3 x height x width, or a batch of them."
-        )
-    if not torch.isfinite(picture).all():
-        raise BadViews(
-            f"VapPrompt: {key} has numbers that are not finite; mend the camera, or skip the frame."
-        )
-    low, high = picture.min().item(), picture.max().item()
-    if low < -SLACK or high > 1 + SLACK:
-        raise BadViews(
-            f"VapPrompt: {key} has numbers from {low:g} to {high:g}; give floats in 0..1, and let "
-            "the normaliser come after this step."
-        )
-
-
-def _place_of_step(steps: Sequence[Mapping[str, Any]]) -> int:
-    """Where the prompting step goes: behind the renaming of observations, else first."""
-    for i, step in enumerate(steps):
-        if step.get("registry_name") == RENAMING_STEP:
-            return i + 1
-    return 0
-
-
-def _shorten(rows: Iterable[EpisodeRow], max_steps: int | None) -> list[EpisodeRow]:
-    """The rows, with `max_steps` at most where it is given."""
-    shortened = []
-    for row in rows:
-        if max_steps is not None:
-            row = replace(row, max_steps=min(row.max_steps, max_steps))
-        shortened.append(row)
-    return shortened
 
 
 def _check_max_steps(max_steps: int | None) -> None:
@@ -540,9 +510,3 @@ def _lerobot_observation(observation: Mapping[str, Any], step: int) -> dict[str,
         "agent_pos": observation["state"],
         "vap_step": np.array([step], np.float32),
     }
-
-
-def _pixels(images: torch.Tensor) -> np.ndarray:
-    """lerobot's floats in 0..1, B x C x H x W, as the RGB bytes that they were."""
-    levels = (images.detach().cpu().float() * 255).round().clamp(0, 255).to(torch.uint8)
-    return np.ascontiguousarray(levels.permute(0, 2, 3, 1).numpy())

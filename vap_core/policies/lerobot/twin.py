@@ -6,6 +6,7 @@ lerobot finds the device of `NameConfig` as `Name` in this module's package.
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -54,16 +55,6 @@ OPEN = 100.0
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class TwinCamera:
-    """What lerobot asks of a robot's camera, which here is no device."""
-
-    height: int
-    width: int
-    fps: int
-    is_connected: bool = True
-
-
 class VapSo101Twin(Robot):
     """One episode of a suite, from `connect` to `disconnect`. Reads and acts in one thread.
 
@@ -83,11 +74,13 @@ class VapSo101Twin(Robot):
         self._scene: Scene | None = None
         self._env: Env | None = None
         self._judge: Judge | None = None
-        self._joints = (*robots.get(ROBOT).joints, GRIPPER)
+        self._joints = _joints()
         side = config.image_size
-        self.cameras = {}
-        for camera in self.suite.cameras:
-            self.cameras[camera] = TwinCamera(side, side, round(self.suite.hz))
+        # What lerobot asks of a robot's camera, which here is no device.
+        camera = SimpleNamespace(
+            height=side, width=side, fps=round(self.suite.hz), is_connected=True
+        )
+        self.cameras = dict.fromkeys(self.suite.cameras, camera)
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -96,7 +89,7 @@ class VapSo101Twin(Robot):
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return {f"{joint}.pos": float for joint in self._joints}
+        return {f"{joint}.pos": float for joint in _joints()}
 
     @property
     def env(self) -> Env:
@@ -120,7 +113,8 @@ class VapSo101Twin(Robot):
         self._env.reset(self.row)
         self._judge = Judge.start(self.row, self._scene.sizes_m, self._env.truth())
         CONNECTED.append(self)
-        logger.info("twin: %s, episode %d: %s", *self._title())
+        task = f"{self.row.suite}/{self.row.task}"
+        logger.info("twin: %s, episode %d: %s", task, self.row.episode, self.row.instruction)
 
     def calibrate(self) -> None:
         """A simulated arm is calibrated."""
@@ -130,14 +124,9 @@ class VapSo101Twin(Robot):
 
     def get_observation(self) -> dict[str, Any]:
         seen = self.env.observe()
-        n = len(self._joints) - 1
-        degrees = np.rad2deg(seen.state[-n:])
+        degrees = np.rad2deg(seen.state[1 - len(self._joints) :])
         positions = [*degrees.tolist(), OPEN * float(seen.state[6])]
-        observation = {
-            f"{joint}.pos": position
-            for joint, position in zip(self._joints, positions, strict=True)
-        }
-        return {**observation, **seen.images}
+        return {**dict(zip(self.action_features, positions, strict=True)), **seen.images}
 
     def send_action(self, action: Mapping[str, float]) -> dict[str, float]:
         """Go towards the positions for one control step; returns what was commanded.
@@ -155,9 +144,14 @@ class VapSo101Twin(Robot):
         moves = np.deg2rad(goals[:-1]) - command.joints
         gripper = float(np.clip(goals[-1] / OPEN, 0.0, 1.0))
         env.step(np.array([*moves, gripper], np.float32))
-        self._follow()
+        judge = self._judge
+        assert judge is not None
+        if not judge.done and judge.steps < self.row.max_steps:
+            self._judge = judge = judge.step(env.truth())
+            if judge.done:
+                logger.info("twin: %s at step %d", judge.outcome().status, judge.steps)
         sent = [*np.rad2deg(env.command.joints).tolist(), OPEN * env.command.gripper]
-        return {f"{joint}.pos": at for joint, at in zip(self._joints, sent, strict=True)}
+        return dict(zip(self.action_features, sent, strict=True))
 
     def disconnect(self) -> None:
         if self._judge is not None:
@@ -174,18 +168,6 @@ class VapSo101Twin(Robot):
         if self._judge is None:
             raise ConnectionError("vap_so101_twin: not connected; call connect first.")
         return self._judge.outcome()
-
-    def _follow(self) -> None:
-        """Judge the step that was done, until the episode is decided."""
-        assert self._judge is not None
-        if self._judge.done or self._judge.steps >= self.row.max_steps:
-            return
-        self._judge = self._judge.step(self.env.truth())
-        if self._judge.done:
-            logger.info("twin: %s at step %d", self._judge.outcome().status, self._judge.steps)
-
-    def _title(self) -> tuple[str, int, str]:
-        return f"{self.row.suite}/{self.row.task}", self.row.episode, self.row.instruction
 
 
 CONNECTED: list[VapSo101Twin] = []
@@ -210,7 +192,7 @@ class VapExpert(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return {f"{joint}.pos": float for joint in (*robots.get(ROBOT).joints, GRIPPER)}
+        return {f"{joint}.pos": float for joint in _joints()}
 
     @property
     def feedback_features(self) -> dict[str, Any]:
@@ -254,6 +236,10 @@ class VapExpert(Teleoperator):
     def disconnect(self) -> None:
         self._state = None
         self._of = None
+
+
+def _joints() -> tuple[str, ...]:
+    return (*robots.get(ROBOT).joints, GRIPPER)
 
 
 def _row(config: VapSo101TwinConfig) -> EpisodeRow:

@@ -5,7 +5,7 @@ commanded pose along them within the speed limits, in whichever control the suit
 anew when a grasp came up empty. Poses are of the tcp in the robot's base frame, in metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -87,8 +87,7 @@ class Expert:
 
         Raises: OutOfReach.
         """
-        plan = _plan_miss(env, env.truth(), rng)
-        return ExpertState("miss", plan)
+        return ExpertState("miss", _plan_miss(env, env.truth(), rng))
 
     def plan_from_simulation(
         self, states: Sequence[ExpertState], envs: Sequence[Env]
@@ -97,60 +96,44 @@ class Expert:
 
         Raises: OutOfReach when the next phase cannot be planned.
         """
-        next_states = [self._advance(state, env) for state, env in zip(states, envs, strict=True)]
-        chunks = [
-            _step_towards(state.plan[0], env)[None]
-            for state, env in zip(next_states, envs, strict=True)
+        pairs = list(zip(states, envs, strict=True))
+        after = [self._advance(state, env) for state, env in pairs]
+        return after, [
+            _step_towards(state.plan[0], env)[None] for state, env in zip(after, envs, strict=True)
         ]
-        return next_states, chunks
 
     def _advance(self, state: ExpertState, env: Env) -> ExpertState:
         """Drop the waypoints that are reached; when none is left, plan the next phase."""
-        plan = state.plan
-        waited = state.waited_s
+        plan, waited, attempt = state.plan, state.waited_s, state.attempt
         if plan and _reached(plan[0], env, waited):
-            plan = plan[1:]
-            waited = 0.0
+            plan, waited = plan[1:], 0.0
         elif plan:
-            waited += _dwell(plan[0], env)
+            # Seconds count in full once the command is there, and less before, so that nothing
+            # waits for ever.
+            distance, angle = _pose_error(plan[0].tcp_base, env.command.tcp_base)
+            there = distance < 0.003 and angle < 0.02 and _gripper_there(plan[0], env)
+            waited += (1.0 if there else 0.1) / env.hz
         if plan:
-            return ExpertState(state.phase, plan, waited, state.attempt)
-        return self._plan_phase(state, env)
-
-    def _plan_phase(self, state: ExpertState, env: Env) -> ExpertState:
-        """The state at the beginning of the next phase."""
-        truth = env.truth()
-        row = env.row
-        attempt = state.attempt
-        plan: tuple[Waypoint, ...]
+            return ExpertState(state.phase, plan, waited, attempt)
+        row, truth = env.row, env.truth()
         if row.rule == "selected":
-            plan = _plan_touch(env, truth, attempt)
-            return ExpertState("touch", plan, attempt=attempt + 1)
+            return ExpertState("touch", _plan_touch(env, truth, attempt), attempt=attempt + 1)
         if state.phase == "carry" and row.target in truth.held:
-            if row.rule == "picked":
-                return ExpertState(
-                    "carry",
-                    (Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.02), 0.0, 0.5),),
-                    attempt=attempt,
-                )
-            plan = _plan_set_down(env, truth)
-            return ExpertState("leave", plan, attempt=attempt)
-        if state.phase == "grasp":
-            plan = _plan_take(env, truth, attempt)
-            return ExpertState("carry", plan, attempt=attempt + 1)
-        return ExpertState(
-            "grasp",
-            (Waypoint(_raised_within_reach(env, env.command.tcp_base, 0.06), 1.0, 0.1),),
-            attempt=attempt,
-        )
+            if row.rule != "picked":
+                return ExpertState("leave", _plan_set_down(env, truth), attempt=attempt)
+            phase, pause = "carry", Waypoint(_raised_within_reach(env, None, 0.02), 0.0, 0.5)
+        elif state.phase == "grasp":
+            return ExpertState("carry", _plan_take(env, truth, attempt), attempt=attempt + 1)
+        else:
+            phase, pause = "grasp", Waypoint(_raised_within_reach(env, None, 0.06), 1.0, 0.1)
+        return ExpertState(phase, (pause,), attempt=attempt)
 
 
 def _step_towards(waypoint: Waypoint, env: Env) -> Action:
     """One step from the commanded pose to the waypoint, as fast as allowed."""
     seconds = 1.0 / env.hz
     command = env.command
-    grip = waypoint.gripper - command.gripper
-    grip = float(np.clip(grip, -GRIP_S * seconds, GRIP_S * seconds))
+    grip = float(np.clip(waypoint.gripper - command.gripper, -GRIP_S * seconds, GRIP_S * seconds))
     return action_towards(
         arm(env.robot.name),
         command,
@@ -167,23 +150,12 @@ def _reached(waypoint: Waypoint, env: Env, waited_s: float) -> bool:
     distance, angle = _pose_error(waypoint.tcp_base, env.tcp_base())
     if waited_s > PATIENCE_S + waypoint.stay_s:
         return True
-    return (
-        distance < ARRIVED_M
-        and angle < ARRIVED_RAD
-        and waited_s >= waypoint.stay_s
-        and abs(env.command.gripper - waypoint.gripper) < 0.01
-    )
+    close = distance < ARRIVED_M and angle < ARRIVED_RAD
+    return close and waited_s >= waypoint.stay_s and _gripper_there(waypoint, env)
 
 
-def _dwell(waypoint: Waypoint, env: Env) -> float:
-    """The seconds that one step counts at a waypoint.
-
-    They count in full once the command is there, and less before, so that nothing waits for ever.
-    """
-    distance, angle = _pose_error(waypoint.tcp_base, env.command.tcp_base)
-    gripper_there = abs(env.command.gripper - waypoint.gripper) < 0.01
-    there = distance < 0.003 and angle < 0.02 and gripper_there
-    return (1.0 if there else 0.1) / env.hz
+def _gripper_there(waypoint: Waypoint, env: Env) -> bool:
+    return abs(env.command.gripper - waypoint.gripper) < 0.01
 
 
 def _pose_error(pose: TcpPose, reference: TcpPose) -> tuple[float, float]:
@@ -196,19 +168,19 @@ def _pose_error(pose: TcpPose, reference: TcpPose) -> tuple[float, float]:
 def _plan_take(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
     """Over the target, down, close, and up until it is clear of everything."""
     low = _grasp_pose(env, truth, attempt)
-    above = _clear_pose(env, truth, low)
-    lift_m = (
-        _height_of_others(env, truth)
-        - float(points_world(env.row.target, truth.objects_world[env.row.target])[:, 2].min())
-        + 0.015
-    )
-    lift = _raised_within_reach(env, low, max(0.09, lift_m))
+    foot = float(_points(env, truth)[:, 2].min())
+    lift = _raised_within_reach(env, low, max(0.09, _height_of_others(env, truth) - foot + 0.015))
     return (
-        Waypoint(above, 1.0),
+        Waypoint(_clear_pose(env, truth, low), 1.0),
         Waypoint(low, 1.0),
         Waypoint(low, 0.0, 0.3),
         Waypoint(lift, 0.0),
     )
+
+
+def _points(env: Env, truth: Truth) -> Float64[np.ndarray, "n 3"]:
+    """The points of the target's surface in the world."""
+    return points_world(env.row.target, truth.objects_world[env.row.target])
 
 
 def _plan_miss(env: Env, truth: Truth, rng: np.random.Generator) -> tuple[Waypoint, ...]:
@@ -231,31 +203,27 @@ def _plan_miss(env: Env, truth: Truth, rng: np.random.Generator) -> tuple[Waypoi
 
 def _plan_set_down(env: Env, truth: Truth) -> tuple[Waypoint, ...]:
     """Carry the held target to its goal, lower it, let go, and draw back."""
-    points = points_world(env.row.target, truth.objects_world[env.row.target])
+    points = _points(env, truth)
     centre = (points.min(axis=0) + points.max(axis=0))[:2] / 2
     foot = float(points[:, 2].min())
     spots, floor = _put_down_spots(env, truth)
     base = _base_from_world(env)
     about = base @ np.array([*centre, 0.0]) - base @ env.robot.base_world[:3]
     now = env.tcp_base()
-    poses = []
-    for spot in spots:
-        shift = base @ np.array([*(spot - centre), floor - foot])
-        for yaw in np.deg2rad(PUT_DOWN_YAWS_DEG).tolist():
-            poses.append(_turned(now, about, shift, yaw))
+    shifts = [base @ np.array([*(spot - centre), floor - foot]) for spot in spots]
+    yaws = np.deg2rad(PUT_DOWN_YAWS_DEG).tolist()
+    poses = [_turned(now, about, shift, yaw) for shift in shifts for yaw in yaws]
     down = _first_within_reach(env, poses, 0.006)
     if down is None:
         raise OutOfReach(
             f"Expert: {env.row.key}: {env.robot.name} cannot reach {env.row.goal} with "
             f"{env.row.target} in its hand; move it closer."
         )
-    above = _raised_within_reach(env, down, foot - floor)
-    away = _raised_within_reach(env, down, 0.08)
     return (
-        Waypoint(above, 0.0, 0.1),
+        Waypoint(_raised_within_reach(env, down, foot - floor), 0.0, 0.1),
         Waypoint(down, 0.0, 0.15),
         Waypoint(down, 1.0, 0.1),
-        Waypoint(away, 1.0, 0.8),
+        Waypoint(_raised_within_reach(env, down, 0.08), 1.0, 0.8),
     )
 
 
@@ -264,15 +232,14 @@ def _plan_touch(env: Env, truth: Truth, attempt: int) -> tuple[Waypoint, ...]:
 
     Every second attempt goes for its highest part instead.
     """
-    points = points_world(env.row.target, truth.objects_world[env.row.target])
+    points = _points(env, truth)
     top = float(points[:, 2].max())
     place = (points.min(axis=0) + points.max(axis=0)) / 2
     if attempt % 2:
         place = points[points[:, 2] > top - 0.006].mean(axis=0)
     tip = np.array([place[0], place[1], top - 0.025])
-    poses = [
-        _pointing_down(env, tip, yaw) for yaw in np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist()
-    ]
+    yaws = np.deg2rad(np.arange(0.0, 360.0, 30.0)).tolist()
+    poses = [_pointing_down(env, tip, yaw) for yaw in yaws]
     pose = _first_within_reach(env, _nearest_turn_first(env, poses), 0.02)
     if pose is None:
         raise OutOfReach(
@@ -309,24 +276,16 @@ def _pose_of_grasp(env: Env, grasp: Grasp) -> TcpPose | None:
     The hand turns the shorter way.
     """
     poses = [_pointing_down(env, grasp.tcp_world, grasp.axis_rad + turn) for turn in (0.0, np.pi)]
+    # So far along the opening axis that a fixed jaw stands close by: what the other jaw pushes far
+    # topples.
+    jaw = env.robot.fixed_jaw_m
+    shift = float(np.sign(jaw) * max(abs(jaw) - grasp.span_m / 2 - JAW_GAP_M, 0.0))
     for pose in _nearest_turn_first(env, poses):
-        pose[:3, 3] -= pose[:3, 1] * _shift_to_fixed_jaw(env, grasp)
+        pose[:3, 3] -= pose[:3, 1] * shift
         reached = _within_reach(env, pose, 0.003)
-        if reached is None:
-            continue
-        if _within_reach(env, _raised(pose, 0.04), 0.006) is not None:
+        if reached is not None and _within_reach(env, _raised(pose, 0.04), 0.006) is not None:
             return reached
     return None
-
-
-def _shift_to_fixed_jaw(env: Env, grasp: Grasp) -> float:
-    """How far along the opening axis the hand moves so that a fixed jaw stands close by.
-
-    What the other jaw pushes far topples.
-    """
-    jaw = env.robot.fixed_jaw_m
-    gap = abs(jaw) - grasp.span_m / 2 - JAW_GAP_M
-    return float(np.sign(jaw) * max(gap, 0.0))
 
 
 def _clear_pose(env: Env, truth: Truth, low: TcpPose) -> TcpPose:
@@ -348,23 +307,18 @@ def _within_reach(env: Env, pose: TcpPose, tolerance_m: float) -> TcpPose | None
     return kinematics.forward(joints)
 
 
-def _first_within_reach(env: Env, poses: Sequence[TcpPose], tolerance_m: float) -> TcpPose | None:
+def _first_within_reach(env: Env, poses: Iterable[TcpPose], tolerance_m: float) -> TcpPose | None:
     """The first of several poses that the arm can take, as it takes it."""
-    for pose in poses:
-        reached = _within_reach(env, pose, tolerance_m)
-        if reached is not None:
-            return reached
-    return None
+    reached = (_within_reach(env, pose, tolerance_m) for pose in poses)
+    return next((pose for pose in reached if pose is not None), None)
 
 
-def _raised_within_reach(env: Env, pose: TcpPose, height_m: float) -> TcpPose:
-    """`pose` raised by `height_m`, or by as much of it as the arm can do."""
-    for less in np.arange(0.0, max(height_m, 0.0), LIFT_STEP_M).tolist():
-        raised = _raised(pose, height_m - less)
-        reached = _within_reach(env, raised, 0.006)
-        if reached is not None:
-            return reached
-    return pose
+def _raised_within_reach(env: Env, pose: TcpPose | None, height_m: float) -> TcpPose:
+    """`pose` (None: the commanded one) raised by `height_m`, or by as much as the arm can do."""
+    start = env.command.tcp_base if pose is None else pose
+    less = np.arange(0.0, max(height_m, 0.0), LIFT_STEP_M).tolist()
+    reached = _first_within_reach(env, (_raised(start, height_m - m) for m in less), 0.006)
+    return start if reached is None else reached
 
 
 def _nearest_turn_first(env: Env, poses: Sequence[TcpPose]) -> list[TcpPose]:
@@ -396,15 +350,23 @@ def _put_down_spots(env: Env, truth: Truth) -> tuple[list[Float64[np.ndarray, "2
     if row.rule == "put":
         return [goal[:2].copy()], float(goal[2]) + 0.016
     target = truth.objects_world[row.target]
-    goal_size = _diagonal(row.goal, goal)
-    reach = 0.5 * (goal_size + _diagonal(row.target, target)) + 0.10 - BESIDE_M
+    diagonals = [
+        np.hypot(*np.ptp(points_world(name, pose), axis=0)[:2])
+        for name, pose in ((row.goal, goal), (row.target, target))
+    ]
+    reach = 0.5 * (diagonals[0] + diagonals[1]) + 0.10 - BESIDE_M
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    others = [
+        pose for name, pose in truth.objects_world.items() if name not in (row.target, row.goal)
+    ]
     fitting = []
     farthest = None
     for nearer in NEARER_M:
         distance = reach - nearer
         spots = goal[:2] + distance * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        room = np.array([_distance_to_others(spot, env, truth) for spot in spots])
+        # The least distance from an object other than target and goal; 1 m without any.
+        apart = [np.hypot(*(spots - pose[:2]).T) for pose in others]
+        room = np.min(apart, axis=0) if apart else np.ones(len(spots))
         way = np.hypot(*(spots - target[:2]).T)
         worth = np.minimum(room, 0.13) - 0.1 * way
         order = np.argsort(-worth, kind="stable").tolist()
@@ -414,33 +376,16 @@ def _put_down_spots(env: Env, truth: Truth) -> tuple[list[Float64[np.ndarray, "2
     return fitting or [farthest], float(goal[2]) + 0.004
 
 
-def _diagonal(name: str, pose: Float64[np.ndarray, "7"]) -> np.floating:
-    """The horizontal diagonal of an object's bounding box."""
-    extent = np.ptp(points_world(name, pose), axis=0)
-    return np.hypot(*extent[:2])
-
-
-def _distance_to_others(spot: Float64[np.ndarray, "2"], env: Env, truth: Truth) -> float:
-    """The least distance of a spot from an object other than target and goal; 1 m without any."""
-    distances = []
-    for name, pose in truth.objects_world.items():
-        if name not in (env.row.target, env.row.goal):
-            distance = np.hypot(*(spot - pose[:2]))
-            distances.append(float(distance))
-    return min(distances, default=1.0)
-
-
 def _height_of_others(env: Env, truth: Truth) -> float:
     """The height of the tallest object on the table, metres in the world.
 
     The target counts as long as it is not in the hand.
     """
-    heights = []
-    for name, pose in truth.objects_world.items():
-        if name != env.row.target or name not in truth.held:
-            points = points_world(name, pose)
-            heights.append(float(points[:, 2].max()))
-    return max(heights)
+    return max(
+        float(points_world(name, pose)[:, 2].max())
+        for name, pose in truth.objects_world.items()
+        if name != env.row.target or name not in truth.held
+    )
 
 
 def _pointing_down(env: Env, tcp_world: Float64[np.ndarray, "3"], axis_rad: float) -> TcpPose:

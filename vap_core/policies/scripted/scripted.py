@@ -48,39 +48,23 @@ class Random:
     def plan_from_simulation(
         self, states: Sequence[RandomState], envs: Sequence[Env]
     ) -> tuple[list[RandomState], list[Chunk]]:
-        next_states = []
+        after = []
         chunks = []
         for state, env in zip(states, envs, strict=True):
             rng = copy.deepcopy(state.rng)
-            drawn = _draw(rng, state.last, env)
-            next_states.append(RandomState(rng, drawn))
-            chunks.append(_action(drawn)[None])
-        return next_states, chunks
-
-
-def _draw(
-    rng: np.random.Generator, last: Float32[np.ndarray, " before"], env: Env
-) -> Float32[np.ndarray, " a"]:
-    """The next draw: a share of the last one and fresh noise."""
-    if not len(last):
-        last = np.zeros(env.action_size, np.float32)
-    fresh = rng.standard_normal(env.action_size) * _scales(env)
-    return (KEEP * last + np.sqrt(1 - KEEP**2) * fresh).astype(np.float32)
-
-
-def _action(drawn: Float32[np.ndarray, " a"]) -> Float32[np.ndarray, " a"]:
-    """The action of a draw; the gripper is as often nearly closed as nearly open."""
-    gripper = np.clip(0.5 + drawn[-1], 0.0, 1.0)
-    return np.array([*drawn[:-1], gripper], np.float32)
-
-
-def _scales(env: Env) -> Float64[np.ndarray, " a"]:
-    """The deviation of every number of an action."""
-    if env.control == "ee":
-        rates = [MOVE_M_S] * 3 + [TURN_RAD_S] * 3
-    else:
-        rates = [JOINT_RAD_S] * (env.action_size - 1)
-    return np.array([*(rate / env.hz for rate in rates), 1.0])
+            # A share of the last draw and fresh noise, by the deviation of every number.
+            last = state.last if len(state.last) else np.zeros(env.action_size, np.float32)
+            rates = [JOINT_RAD_S] * (env.action_size - 1)
+            if env.control == "ee":
+                rates = [MOVE_M_S] * 3 + [TURN_RAD_S] * 3
+            scales = np.array([*(rate / env.hz for rate in rates), 1.0])
+            fresh = rng.standard_normal(env.action_size) * scales
+            drawn = (KEEP * last + np.sqrt(1 - KEEP**2) * fresh).astype(np.float32)
+            after.append(RandomState(rng, drawn))
+            # The gripper is as often nearly closed as nearly open.
+            gripper = np.clip(0.5 + drawn[-1], 0.0, 1.0)
+            chunks.append(np.array([[*drawn[:-1], gripper]], np.float32))
+        return after, chunks
 
 
 COLOUR_NAMES = "|".join(colour.name for colour in PALETTE)
@@ -170,16 +154,16 @@ class MonocularLocalizer:
         boxes = self.detector([rgb], command.category)[0]
         if not len(boxes):
             return None
-        if command.colour is not None:
-            shares = coloured(rgb, boxes, command.colour)
-            if shares.max() >= COLOURED:
-                best = int(shares.argmax())
-                return self.place(boxes.xyxy[best], self.thick_m)
-        if before is not None:
-            return self._nearest(boxes, before)
-        confident = boxes.xyxy[boxes.score >= CONFIDENT * boxes.score[0]]
-        drawn = int(draw * len(confident))
-        return self.place(confident[drawn], self.thick_m)
+        best = self._of_colour(rgb, boxes, command.colour)
+        if best is not None:
+            return self.place(boxes.xyxy[best], self.thick_m)
+        if before is None:
+            confident = boxes.xyxy[boxes.score >= CONFIDENT * boxes.score[0]]
+            return self.place(confident[int(draw * len(confident))], self.thick_m)
+        places = [self.place(box, self.thick_m) for box in boxes.xyxy]
+        distances = [float(np.hypot(*(place - before)[:2])) for place in places]
+        nearest = int(np.argmin(distances))
+        return places[nearest] if distances[nearest] < STAYED_M else None
 
     def find(self, rgb: Rgb, category: str, colour: Colour | None = None) -> Place | None:
         """Where the most confident box of a category stands; None when there is none.
@@ -189,12 +173,12 @@ class MonocularLocalizer:
         boxes = self.detector([rgb], category)[0]
         if not len(boxes):
             return None
-        chosen = 0
-        if colour is not None:
-            shares = coloured(rgb, boxes, colour)
-            if shares.max() >= COLOURED:
-                chosen = int(shares.argmax())
-        return self.place(boxes.xyxy[chosen], WIDEST_M)
+        return self.place(boxes.xyxy[self._of_colour(rgb, boxes, colour) or 0], WIDEST_M)
+
+    def _of_colour(self, rgb: Rgb, boxes: Boxes, colour: Colour | None) -> int | None:
+        """The box that has most of a colour; None where none has enough of it."""
+        shares = coloured(rgb, boxes, colour) if colour is not None else np.zeros(1)
+        return int(shares.argmax()) if shares.max() >= COLOURED else None
 
     def place(self, box: Float32[np.ndarray, "4"], thick_m: float) -> Place:
         """The place of an upright object by its box: that of the cylinder whose outline fills it.
@@ -210,43 +194,31 @@ class MonocularLocalizer:
         guess = np.array([on_table[0], on_table[1], 0.8 * thick_m, 0.08])
         low = np.array([-2.0, -2.0, 0.5 * min(thick_m, 0.03), 0.02])
         high = np.array([2.0, 2.0, thick_m, 0.25])
-
-        def residual(cylinder: Place) -> Float64[np.ndarray, "4"]:
-            return self._outline(cylinder) - box
-
         start = np.clip(guess, low + 1e-6, high - 1e-6)
-        fit = least_squares(residual, start, bounds=(low, high), max_nfev=20)
+        fit = least_squares(
+            lambda cylinder: self._outline(cylinder) - box, start, bounds=(low, high), max_nfev=20
+        )
         return fit.x
-
-    def _nearest(self, boxes: Boxes, before: Place) -> Place | None:
-        """The place nearest to `before`; None when it is too far away."""
-        places = []
-        distances = []
-        for box in boxes.xyxy:
-            place = self.place(box, self.thick_m)
-            places.append(place)
-            distance = np.hypot(*(place - before)[:2])
-            distances.append(float(distance))
-        nearest = int(np.argmin(distances))
-        if distances[nearest] < STAYED_M:
-            return places[nearest]
-        return None
 
     def _outline(self, cylinder: Place) -> Float64[np.ndarray, "4"]:
         """The box (pixels) around the picture of a cylinder on the table."""
         x, y, radius, height = cylinder
         rim = radius * RING + (x, y)
-        bottom = np.c_[rim, np.full(len(rim), self.table_z)]
-        top = np.c_[rim, np.full(len(rim), self.table_z + height)]
+        rims = [np.c_[rim, np.full(len(rim), self.table_z + z)] for z in (0.0, height)]
         turn, eye = self._base_from_camera()
-        points = (np.concatenate([bottom, top]) - eye) @ turn
+        points = (np.concatenate(rims) - eye) @ turn
         k = self.camera.k
         pixels = (points[:, :2] / points[:, 2:]) * (k[0, 0], k[1, 1]) + k[:2, 2]
         return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
 
     def _base_from_camera(self) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
         """Rotation from camera to robot base axes, and the camera's position in the base frame."""
-        pose = np.linalg.inv(_matrix(self.base_world)) @ self.camera.pose_world
+        from scipy.spatial.transform import Rotation
+
+        base = np.eye(4)
+        base[:3, :3] = Rotation.from_quat(self.base_world[3:], scalar_first=True).as_matrix()
+        base[:3, 3] = self.base_world[:3]
+        pose = np.linalg.inv(base) @ self.camera.pose_world
         return pose[:3, :3], pose[:3, 3]
 
 
@@ -266,28 +238,11 @@ def _target_span(text: str) -> re.Match[str] | None:
     place = PLACE.search(text)
     if place and spans and spans[0].start() < place.start():
         spans = [span for span in spans if span.start() < place.start()]
-    for span in spans:
-        if span["colour"]:
-            return span
-    return spans[0] if spans else None
+    return next((span for span in spans if span["colour"]), spans[0] if spans else None)
 
 
 def _colour_named(name: str | None) -> Colour | None:
-    if name is None:
-        return None
-    for colour in PALETTE:
-        if colour.name == name.lower():
-            return colour
-    return None
-
-
-def _matrix(pose: Pose) -> Float64[np.ndarray, "4 4"]:
-    from scipy.spatial.transform import Rotation
-
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
-    matrix[:3, 3] = pose[:3]
-    return matrix
+    return next((colour for colour in PALETTE if colour.name == (name or "").lower()), None)
 
 
 SPEED_M_S = 0.20
@@ -385,8 +340,7 @@ class Scripted:
         self.execute = max(1, round(REPLAN_S * hz))
 
     def start(self, rng: np.random.Generator) -> ScriptedState:
-        draw = float(rng.random())
-        return ScriptedState(draw=draw, goal=None, phase="seek", waited_s=0.0)
+        return ScriptedState(float(rng.random()), None, "seek", 0.0)
 
     def plan(
         self, states: Sequence[ScriptedState], inputs: Sequence[PolicyInput]
@@ -397,13 +351,8 @@ class Scripted:
             looks_for_goal = state.spot is None and bool(read(policy_input.text).goal)
             if state.phase in LOCALIZING or looks_for_goal:
                 report_input(i, camera, policy_input.images[camera])
-        next_states = []
-        chunks = []
-        for state, policy_input in zip(states, inputs, strict=True):
-            next_state, chunk = self._plan_episode(state, policy_input)
-            next_states.append(next_state)
-            chunks.append(chunk)
-        return next_states, chunks
+        planned = [self._plan_episode(*pair) for pair in zip(states, inputs, strict=True)]
+        return [state for state, _ in planned], [chunk for _, chunk in planned]
 
     def _plan_episode(
         self, state: ScriptedState, policy_input: PolicyInput
@@ -415,14 +364,22 @@ class Scripted:
             if found is not None:
                 state = replace(state, goal=found)
         if command.goal and state.goal is not None and state.spot is None:
+            target = state.goal
             place = self.localizer.find(rgb, command.goal, command.goal_colour)
-            state = replace(
-                state, spot=_put_down_spot(place, state.goal, command, self.motion.beside_m)
-            )
+            if place is not None and command.verb == "put":
+                state = replace(state, spot=np.array([*place[:2], 0.015]))
+            elif place is not None:  # near it, on the side of the target
+                towards = target[:2] - place[:2]
+                towards /= max(float(np.linalg.norm(towards)), 1e-9)
+                distance = place[2] + target[2] + self.motion.beside_m
+                state = replace(state, spot=np.array([*(place[:2] + distance * towards), 0.0]))
         hand = policy_input.state[:3].astype(np.float64)
         opening = float(policy_input.state[6])
         joints = policy_input.state[7:].astype(np.float64)
-        state = self._advance(state, command, hand, opening)
+        if state.goal is not None:
+            phase = self._next_phase(state, command, hand, opening)
+            waited_s = state.waited_s + self.execute / self.hz if phase == state.phase else 0.0
+            state = replace(state, phase=phase, waited_s=waited_s)
         if state.joints is None or np.abs(state.joints - joints).max() > LEAD_JOINT_RAD:
             state = replace(state, joints=joints)
         return self._act(state, command, hand)
@@ -449,30 +406,14 @@ class Scripted:
             elif state.goal is None:
                 rows.append([*np.zeros(len(joints)), opening])
             else:
-                solved = self._joints_at(hand, joints)
+                # One step from `joints` towards those that bring the hand there, pointing down.
+                pose = np.eye(4)
+                pose[:3, :3] = self.robot.down_base
+                pose[:3, 3] = hand
+                solved = arm(self.robot.name).solve(joints, pose, 1.0 / self.hz)
                 rows.append([*(solved - joints), opening])
                 joints = solved
         return replace(state, joints=joints), np.asarray(rows, np.float32)
-
-    def _joints_at(
-        self, hand: Point, joints: Float64[np.ndarray, " n"]
-    ) -> Float64[np.ndarray, " n"]:
-        """The joints one step from `joints` that bring the hand there, pointing down."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.robot.down_base
-        pose[:3, 3] = hand
-        return arm(self.robot.name).solve(joints, pose, 1.0 / self.hz)
-
-    def _advance(
-        self, state: ScriptedState, command: Command, hand: Point, opening: float
-    ) -> ScriptedState:
-        """Move on to the next phase when this one's aim is reached."""
-        if state.goal is None:
-            return state
-        phase = self._next_phase(state, command, hand, opening)
-        if phase != state.phase:
-            return replace(state, phase=phase, waited_s=0.0)
-        return replace(state, waited_s=state.waited_s + self.execute / self.hz)
 
     def _next_phase(
         self, state: ScriptedState, command: Command, hand: Point, opening: float
@@ -513,55 +454,18 @@ class Scripted:
         if command.verb == "touch":
             z = hover if state.phase in LOCALIZING else max(height - 0.03, 0.01)
             opening = 0.0
-        elif state.phase in RELEASING:
-            assert state.spot is not None
-            x, y, floor = state.spot
-            z = self._release_height(state.phase, floor + self._grasp_height(height), hover)
-            opening = float(state.phase in ("open", "leave"))
         else:
-            z = self._grasping_height(state.phase, self._grasp_height(height), hover)
-            opening = float(state.phase not in ("close", "lift"))
+            # The grasp's height over the object's foot.
+            share, palm = self.motion.grasp_share, 0.8 * self.robot.palm_m
+            grasp = max(share * height, height - palm, min(0.03, 0.8 * height))
+            if state.phase in RELEASING:
+                assert state.spot is not None
+                x, y, floor = state.spot
+                low = floor + grasp + 0.008
+                z = {"carry": hover + 0.02, "leave": low + 0.10}.get(state.phase, low)
+                opening = float(state.phase in ("open", "leave"))
+            else:
+                heights = {"descend": grasp, "close": grasp, "lift": grasp + self.motion.lift_m}
+                z = heights.get(state.phase, hover)
+                opening = float(state.phase not in ("close", "lift"))
         return np.array([x, y, self.localizer.table_z + z]), opening
-
-    def _grasp_height(self, height: float) -> float:
-        """The height of the grasp of an object of this height, over its foot."""
-        return max(
-            self.motion.grasp_share * height,
-            height - 0.8 * self.robot.palm_m,
-            min(0.03, 0.8 * height),
-        )
-
-    def _grasping_height(self, phase: Phase, grasp: float, hover: float) -> float:
-        """The hand's height over the table until the target is lifted."""
-        if phase in ("descend", "close"):
-            return grasp
-        if phase == "lift":
-            return grasp + self.motion.lift_m
-        return hover
-
-    def _release_height(self, phase: Phase, grasp: float, hover: float) -> float:
-        """The hand's height over the table from the way to the goal on."""
-        low = grasp + 0.008
-        if phase == "carry":
-            return hover + 0.02
-        if phase == "leave":
-            return low + 0.10
-        return low
-
-
-def _put_down_spot(
-    place: Place | None, target: Place, command: Command, beside_m: float
-) -> Point | None:
-    """Where the target goes: x, y and the height of what it stands on there.
-
-    None when the goal is not seen.
-    """
-    if place is None:
-        return None
-    if command.verb == "put":
-        return np.array([*place[:2], 0.015])
-    towards = target[:2] - place[:2]
-    length = float(np.linalg.norm(towards))
-    towards /= max(length, 1e-9)
-    distance = place[2] + target[2] + beside_m
-    return np.array([*(place[:2] + distance * towards), 0.0])
