@@ -8,7 +8,7 @@ import torch
 
 from tests.test_attention import CASES, look, plan, toys
 from vap_core.policies.lerobot.adapter import LeRobot
-from vap_core.policies.lerobot.attribution import _projector, gradient_maps, masking_maps
+from vap_core.policies.lerobot.attribution import gradient_maps, masking_maps, projector
 
 __all__ = ["toys"]
 
@@ -49,7 +49,7 @@ def _half_square(policy: LeRobot, state: Any, one: Any, patch: int, factor: floa
         scaled[:, patch] *= factor
         return scaled
 
-    hook = _projector(policy.policy.model).register_forward_hook(scale)
+    hook = projector(policy.policy.model).register_forward_hook(scale)
     try:
         batch, noise = policy.prepare([state], [one])
         planned = policy.policy.predict_action_chunk(batch, noise=noise)[:, : policy.execute]

@@ -20,6 +20,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
 from lerobot.processor import ProcessorStepRegistry
+from torch.nn.functional import interpolate
 
 from tests.command import refused, vap
 from tests.toys import personal
@@ -28,7 +29,7 @@ from vap_core.base.files import SHIPPED
 from vap_core.cli.own import _task_to_try
 from vap_core.memory import save
 from vap_core.perception.stacks import load_stack
-from vap_core.policies.lerobot.adapter import IMAGE, _resize, load_policy
+from vap_core.policies.lerobot.adapter import IMAGE, load_policy
 from vap_core.policies.lerobot.checkpoints import trained_for
 from vap_core.policies.lerobot.step import VapEnvConfig, attach
 from vap_core.policies.protocol import PolicyInput
@@ -116,7 +117,9 @@ def test_a_mini_pi0_scales_its_images_as_our_loop_does() -> None:
     rgb = torch.rand((2, 3, 224, 224), generator=torch.Generator().manual_seed(0))
     key = "observation.images.front"
     (whole,), _ = policy._preprocess_images({key: rgb})
-    (scaled,), _ = policy._preprocess_images({key: _resize(rgb, (3, 112, 112))})
+    (scaled,), _ = policy._preprocess_images(
+        {key: interpolate(rgb, (112, 112), mode="bilinear", antialias=True)}
+    )
     assert torch.equal(whole, scaled)
 
 

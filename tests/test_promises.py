@@ -251,7 +251,7 @@ def test_keys_are_read_in_one_place_and_shown_in_none() -> None:
     text = (ROOT / "perception" / "chat.py").read_text()
     shown = [line for line in text.splitlines() if re.search(r"\{[^}]*\bkey\b[^}]*\}", line)]
     assert [line.strip() for line in shown] == [
-        'headers["Authorization"] = f"Bearer {endpoint.key}"'
+        'headers = {"Authorization": f"Bearer {endpoint.key}"} if endpoint.key else {}'
     ]
 
 

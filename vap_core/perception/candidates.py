@@ -23,19 +23,16 @@ def embed_crops(what: str, encoder: Encoder, crops: Sequence[Rgb]) -> Float32[np
         begins with `what`.
     """
     rows = encoder(crops)
-    fault = _form_fault(rows, len(crops))
+    fault = ""
+    if not isinstance(rows, np.ndarray):
+        fault = f"{type(rows).__name__}, not a NumPy array"
+    elif rows.ndim != 2 or rows.dtype != np.float32:
+        fault = f"an array of shape {rows.shape} and type {rows.dtype}, not float32 (crops, width)"
+    elif len(rows) != len(crops):
+        fault = f"{len(rows)} rows for {len(crops)} crops"
     if fault:
         raise BadEncoder(describe_fault(what, encoder, fault))
     return rows
-
-
-def _form_fault(rows: object, n: int) -> str:
-    """What keeps a value from being the rows of `n` crops, "" where nothing does."""
-    if not isinstance(rows, np.ndarray):
-        return f"{type(rows).__name__}, not a NumPy array"
-    if rows.ndim != 2 or rows.dtype != np.float32:
-        return f"an array of shape {rows.shape} and type {rows.dtype}, not float32 (crops, width)"
-    return "" if len(rows) == n else f"{len(rows)} rows for {n} crops"
 
 
 def row_fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]) -> str:
@@ -123,24 +120,14 @@ def segment(
 def masks_by_id(parts: Sequence[Candidates]) -> Bool[np.ndarray, "n h w"]:
     """One mask per identity of a view, in the order of identities."""
     masks = np.concatenate([part.masks for part in parts])
-    first_rows: dict[int, int] = {}
-    for row, identity in enumerate(_ids(parts)):
-        first_rows.setdefault(identity, row)
-    return masks[[first_rows[identity] for identity in sorted(first_rows)]]
-
-
-def _ids(parts: Sequence[Candidates]) -> list[int]:
-    """The identities of several phrases' candidates, one after the other."""
-    ids: list[int] = []
-    for part in parts:
-        ids += part.ids
-    return ids
+    _, first_rows = np.unique([i for part in parts for i in part.ids], return_index=True)
+    return masks[first_rows]
 
 
 def _assign_ids(boxes: Boxes, known: Sequence[Candidates]) -> tuple[int, ...]:
     """A known identity for each box that is known already, the next free one for every other."""
     known_xyxy = np.concatenate([np.zeros((0, 4), np.float32), *(c.boxes.xyxy for c in known)])
-    known_ids = _ids(known)
+    known_ids = [i for part in known for i in part.ids]
     next_id = 1 + max(known_ids, default=-1)
     ids: list[int] = []
     for overlap in box_iou(boxes.xyxy, known_xyxy):

@@ -5,17 +5,13 @@ never executed.
 """
 
 import base64
-import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from http.client import HTTPException
 from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any
-from urllib import request
-from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 
 from vap_core.base.errors import BadEndpoint
@@ -47,7 +43,12 @@ class ChatEndpoint:
     """An answer that is not complete by then is given up."""
 
     def __post_init__(self) -> None:
-        if not _is_web_address(self.url):
+        try:
+            parts = urlsplit(self.url)
+            is_address = parts.scheme in ("http", "https") and bool(parts.hostname)
+        except ValueError:
+            is_address = False
+        if not is_address:
             raise BadEndpoint(
                 f"chat: {self.url!r} is no address of a chat endpoint; give one like "
                 f"https://api.openai.com/v1, or set {URL}."
@@ -113,10 +114,8 @@ def request_answer(
 
 def question_message(question: str, images: Sequence[Rgb] = ()) -> dict[str, Any]:
     """One user message: the question, then the images."""
-    content: list[dict[str, Any]] = [{"type": "text", "text": question}]
-    for rgb in images:
-        content.append({"type": "image_url", "image_url": {"url": data_url(rgb)}})
-    return {"role": "user", "content": content}
+    content = [{"type": "image_url", "image_url": {"url": data_url(rgb)}} for rgb in images]
+    return {"role": "user", "content": [{"type": "text", "text": question}, *content]}
 
 
 def answer_in_time[T](
@@ -158,70 +157,46 @@ def data_url(rgb: Rgb) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def _is_web_address(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        return parts.scheme in ("http", "https") and bool(parts.hostname)
-    except ValueError:
-        return False
-
-
 def _fetch(endpoint: ChatEndpoint, body: dict[str, Any], doing: str) -> bytes:
-    """The server's response, of MAX_ANSWER_BYTES at most. Raises: BadEndpoint."""
-    headers = {"Content-Type": "application/json"}
-    if endpoint.key:
-        headers["Authorization"] = f"Bearer {endpoint.key}"
-    post = request.Request(
-        url=f"{endpoint.url.rstrip('/')}/chat/completions",
-        data=json.dumps(body).encode(),
-        headers=headers,
-        method="POST",
-    )
+    """The server's response, of MAX_ANSWER_BYTES at most; no redirect is followed, which would
+    carry the key and the images to another server.
+
+    Raises: BadEndpoint.
+    """
+    import httpx
+
+    who = f"{doing}: {endpoint.url}"
+    headers = {"Authorization": f"Bearer {endpoint.key}"} if endpoint.key else {}
+    url = f"{endpoint.url.rstrip('/')}/chat/completions"
+    data = b""
     try:
-        opener = request.build_opener(_NoRedirects)
-        with opener.open(post, timeout=endpoint.timeout_s) as response:
-            data = response.read(MAX_ANSWER_BYTES + 1)
-        if len(data) <= MAX_ANSWER_BYTES:
-            return data
+        with httpx.stream(
+            "POST", url, json=body, headers=headers, timeout=endpoint.timeout_s
+        ) as response:
+            for part in response.iter_bytes():
+                data += part
+                if len(data) > MAX_ANSWER_BYTES:
+                    raise BadEndpoint(
+                        f"{who} answers with over {MAX_ANSWER_BYTES / 1e6:.0f} MB; is it a chat "
+                        f"endpoint, and {URL} right?"
+                    )
+    except (httpx.HTTPError, httpx.InvalidURL, ValueError, OSError) as error:
         raise BadEndpoint(
-            f"{doing}: {endpoint.url} answers with over {MAX_ANSWER_BYTES / 1e6:.0f} MB; "
-            f"is it a chat endpoint, and {URL} right?"
-        )
-    except HTTPError as error:
-        with error:
-            raise BadEndpoint(
-                f"{doing}: {endpoint.url} refuses ({error.code}: {_refusal_reason(error)}); "
-                f"check {URL}, {MODEL} and {KEY}."
-            ) from error
-    except (URLError, HTTPException, OSError, ValueError) as error:  # ValueError: of an address
-        cause: object = error
-        if isinstance(error, URLError):
-            cause = error.reason
-        raise BadEndpoint(
-            f"{doing}: {endpoint.url} gives no answer ({str(cause) or type(cause).__name__}); "
-            f"is the server up, and {URL} right?"
+            f"{who} gives no answer ({_line(str(error)) or type(error).__name__}); is the server "
+            f"up, and {URL} right?"
         ) from error
-
-
-def _refusal_reason(error: HTTPError) -> str:
-    """What the server says, as one line: a redirect, the protocol's error, or plain text."""
-    if 300 <= error.code < 400 and "Location" in error.headers:
-        return f"it redirects to {_line(error.headers['Location'])}, which is not followed"
-    text = ""
-    with suppress(OSError, HTTPException, ValueError, KeyError, TypeError):
-        text = error.read(2000).decode(errors="replace")
-        text = str(parse_json(text)["error"]["message"])
-    return _line(text) or error.reason
+    if response.is_success:
+        return data
+    reason = data[:2000].decode(errors="replace")
+    with suppress(ValueError, KeyError, TypeError):
+        reason = str(parse_json(reason)["error"]["message"])
+    if response.has_redirect_location:
+        reason = f"it redirects to {response.headers['Location']}, which is not followed"
+    reason = _line(reason) or response.reason_phrase
+    raise BadEndpoint(
+        f"{who} refuses ({response.status_code}: {reason}); check {URL}, {MODEL} and {KEY}."
+    )
 
 
 def _line(text: str) -> str:
     return " ".join(text.split())[:200]
-
-
-class _NoRedirects(request.HTTPRedirectHandler):
-    """Follows no redirect: the request would carry the key and the images to another server."""
-
-    def redirect_request(
-        self, req: request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
-    ) -> None:
-        return None

@@ -109,9 +109,29 @@ class CropAttributes:
 
 def measure_crop(rgb: Rgb, segmenter: Segmenter) -> CropAttributes:
     """The attributes of the object in a crop, whose outline `segmenter` finds."""
-    small = _resize(rgb)
+    scale = SIDE / max(rgb.shape[:2])
+    size = max(8, round(scale * rgb.shape[1])), max(8, round(scale * rgb.shape[0]))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small = cv2.resize(rgb, size, interpolation=how)
     mask = _object_mask(small, segmenter)
-    return _measure(_equalise_exposure(small), mask)
+    # The brightest parts are raised to `BRIGHT_LEVEL`, by a factor of 1.4 at most.
+    brightest = float(np.percentile(small.max(axis=2), 98))
+    gain = float(np.clip(BRIGHT_LEVEL / max(brightest, 1.0), 1.0, 1.4))
+    lit = np.clip(small * gain, 0, 255).astype(np.uint8)
+    lightness = cv2.cvtColor(lit.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[..., 0]
+    indices = colour_indices(lit, mask)
+    parts = {name: (indices == index) & mask for index, name in enumerate(COLOURS)}
+    height, width = _extent(mask)
+    ratio = height / width
+    return CropAttributes(
+        share={name: float(part.sum() / int(mask.sum())) for name, part in parts.items()},
+        lightness={
+            name: float(lightness[part].mean()) if part.any() else 0.0
+            for name, part in parts.items()
+        },
+        pattern={name: pattern_of(part, mask) for name, part in parts.items()},
+        shape="tall" if ratio > 1.6 else "wide" if ratio < 0.9 else "compact",
+    )
 
 
 def pattern_of(part: Bool[np.ndarray, "h w"], whole: Mask) -> str:
@@ -143,17 +163,6 @@ def pattern_of(part: Bool[np.ndarray, "h w"], whole: Mask) -> str:
     return "parts"
 
 
-def _resize(rgb: Rgb) -> Rgb:
-    """The crop with a longer side of `SIDE` pixels."""
-    scale = SIDE / max(rgb.shape[:2])
-    h = max(8, round(scale * rgb.shape[0]))
-    w = max(8, round(scale * rgb.shape[1]))
-    interpolation = cv2.INTER_LINEAR
-    if scale < 1:
-        interpolation = cv2.INTER_AREA
-    return cv2.resize(rgb, (w, h), interpolation=interpolation)
-
-
 def _object_mask(rgb: Rgb, segmenter: Segmenter) -> Mask:
     """The object in a resized crop.
 
@@ -170,40 +179,6 @@ def _object_mask(rgb: Rgb, segmenter: Segmenter) -> Mask:
     x = np.linspace(-1, 1, w)
     y = np.linspace(-1, 1, h)
     return inner | (x[None] ** 2 + y[:, None] ** 2 < CENTRE_RADIUS**2)
-
-
-def _equalise_exposure(rgb: Rgb) -> Rgb:
-    """Raise the brightest parts to `BRIGHT_LEVEL`, by a factor of 1.4 at most."""
-    brightest = float(np.percentile(rgb.max(axis=2), 98))
-    gain = float(np.clip(BRIGHT_LEVEL / max(brightest, 1.0), 1.0, 1.4))
-    return np.clip(rgb * gain, 0, 255).astype(np.uint8)
-
-
-def _measure(rgb: Rgb, mask: Mask) -> CropAttributes:
-    lightness = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[..., 0]
-    indices = colour_indices(rgb, mask)
-    size = int(mask.sum())
-    share: dict[str, float] = {}
-    mean_lightness: dict[str, float] = {}
-    pattern: dict[str, str] = {}
-    for index, name in enumerate(COLOURS):
-        part = (indices == index) & mask
-        share[name] = float(part.sum() / size)
-        mean_lightness[name] = 0.0
-        if part.any():
-            mean_lightness[name] = float(lightness[part].mean())
-        pattern[name] = pattern_of(part, mask)
-    return CropAttributes(share, mean_lightness, pattern, _shape_of(mask))
-
-
-def _shape_of(mask: Mask) -> str:
-    height, width = _extent(mask)
-    ratio = height / width
-    if ratio > 1.6:
-        return "tall"
-    if ratio < 0.9:
-        return "wide"
-    return "compact"
 
 
 def _extent(mask: Mask) -> tuple[int, int]:
@@ -255,9 +230,7 @@ def load_captioner(segmenter: Segmenter, where: str = "offline") -> Captioner:
     """
     if where == "offline":
         return AttributeCaptioner(segmenter)
-    if where == "chat":
-        return ChatCaptioner(endpoint_from_environment())
-    return ChatCaptioner(endpoint_from_environment(where))
+    return ChatCaptioner(endpoint_from_environment("" if where == "chat" else where))
 
 
 def with_description(obj: PersonalObject, captioner: Captioner) -> PersonalObject:
@@ -315,23 +288,25 @@ class ChatCaptioner:
 
 def phrase_attributes(measured: Sequence[CropAttributes], category: str) -> Description:
     """Put what was measured of an object's crops into words."""
-    share = _mean_shares(measured)
+    share = {name: float(np.mean([crop.share[name] for crop in measured])) for name in COLOURS}
+    if share["grey"] < GREY_SHARE:
+        share["grey"] = 0.0
     main_colour, *others = sorted(COLOURS, key=share.__getitem__, reverse=True)
-    main = add_shade(main_colour, _median_lightness(measured, main_colour))
-    prominent: list[str] = []
-    minor: list[str] = []
-    other_shares: list[float] = []
-    busy_pattern = False
-    for name in others:
-        if not share[name] >= MINOR_SHARE:
-            continue
-        pattern = _usual_pattern(measured, name)
-        busy_pattern |= pattern in ("stripes", "spots", "patches")
-        other_shares.append(share[name])
-        if share[name] >= PROMINENT_SHARE:
-            prominent.append(f"{name} {pattern}")
-        else:
-            minor.append(name)
+    shown = {
+        name: [crop for crop in measured if crop.share[name] > MINOR_SHARE] for name in COLOURS
+    }
+    # The most frequent pattern of a colour; "parts" when no crop shows enough of it.
+    patterns = {
+        name: (Counter(crop.pattern[name] for crop in crops).most_common(1) or [("parts", 0)])[0][0]
+        for name, crops in shown.items()
+    }
+    (shape, _), *_ = Counter(crop.shape for crop in measured).most_common(1) or [("parts", 0)]
+    lightness = [crop.lightness[main_colour] for crop in shown[main_colour]]
+    main = add_shade(main_colour, float(np.median(lightness)))
+    seen = [name for name in others if share[name] >= MINOR_SHARE]
+    busy_pattern = any(patterns[name] in ("stripes", "spots", "patches") for name in seen)
+    prominent = [f"{name} {patterns[name]}" for name in seen if share[name] >= PROMINENT_SHARE]
+    minor = [name for name in seen if share[name] < PROMINENT_SHARE]
     prominent = prominent[:2]
 
     short = main
@@ -341,39 +316,10 @@ def phrase_attributes(measured: Sequence[CropAttributes], category: str) -> Desc
         short = f"{main} with {' and '.join(prominent)}"
     if minor:
         details.append(f"a little {' and '.join(minor[:2])}")
-    if busy_pattern and sum(other_shares) > 1.5 * PROMINENT_SHARE:
+    if busy_pattern and sum(share[name] for name in seen) > 1.5 * PROMINENT_SHARE:
         ending = ", patterned all over"
     elif not prominent:
         ending = ", plain"
     if details:
         main = f"{main} with {' and '.join(details)}"
-    return Description(short, f"a {_usual_shape(measured)} {category}, mostly {main}{ending}")
-
-
-def _mean_shares(measured: Sequence[CropAttributes]) -> dict[str, float]:
-    """Every colour's share of the object, over all crops."""
-    share = {name: float(np.mean([crop.share[name] for crop in measured])) for name in COLOURS}
-    if share["grey"] < GREY_SHARE:
-        share["grey"] = 0.0
-    return share
-
-
-def _median_lightness(measured: Sequence[CropAttributes], name: str) -> float:
-    shown = [crop.lightness[name] for crop in measured if crop.share[name] > MINOR_SHARE]
-    return float(np.median(shown))
-
-
-def _usual_pattern(measured: Sequence[CropAttributes], name: str) -> str:
-    """The most frequent pattern of a colour; "parts" when no crop shows enough of it."""
-    shown = Counter(crop.pattern[name] for crop in measured if crop.share[name] > MINOR_SHARE)
-    if not shown:
-        return "parts"
-    return shown.most_common(1)[0][0]
-
-
-def _usual_shape(measured: Sequence[CropAttributes]) -> str:
-    """The most frequent shape; "parts" when there is no crop."""
-    shapes = Counter(crop.shape for crop in measured)
-    if not shapes:
-        return "parts"
-    return shapes.most_common(1)[0][0]
+    return Description(short, f"a {shape} {category}, mostly {main}{ending}")

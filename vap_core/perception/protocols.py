@@ -126,7 +126,9 @@ class JudgedDetector:
 
     def __init__(self, detector: Detector, judge: FamiliarityJudge) -> None:
         self.detector = detector
-        self.judge = judge
+        self.is_familiar = judge.is_familiar
+        if isinstance(detector, ReferenceCropper):
+            self.reference_boxes = detector.reference_boxes
 
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
@@ -137,24 +139,11 @@ class JudgedDetector:
             for image, boxes in zip(images, self.detector(images, phrase, threshold), strict=True)
         ]
 
-    def is_familiar(self, image: Rgb, phrase: str) -> bool:
-        return self.judge.is_familiar(image, phrase)
-
-
-class JudgedCropper(JudgedDetector):
-    """The same of a `ReferenceCropper`."""
-
-    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
-        assert isinstance(self.detector, ReferenceCropper)
-        return self.detector.reference_boxes(photo, phrase, threshold)
-
 
 def judged_by(judge: FamiliarityJudge, detector: Detector) -> Detector:
     """The detector with the judge's word on familiarity, unless it has one of its own."""
     if isinstance(detector, FamiliarityJudge):
         return detector
-    if isinstance(detector, ReferenceCropper):
-        return JudgedCropper(detector, judge)
     return JudgedDetector(detector, judge)
 
 
@@ -203,13 +192,9 @@ class Stack:
         familiar views from others, this stack's detector still says which are, unless `detector`
         does itself (`FamiliarityJudge`).
         """
-        given: dict[str, Any] = {
-            "detector": detector,
-            "encoder": encoder,
-            "segmenter": segmenter,
-            "tracker": tracker,
-        }
-        changed = {role: part for role, part in given.items() if part is not None}
+        roles = ("detector", "encoder", "segmenter", "tracker")
+        given = zip(roles, (detector, encoder, segmenter, tracker), strict=True)
+        changed: dict[str, Any] = {role: part for role, part in given if part is not None}
         if encoder is not None:
             changed["unfamiliar_encoder"] = None
         stays = encoder is None or segmenter is None

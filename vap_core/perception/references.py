@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32
 
 from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Boxes, Rgb, value
-from vap_core.perception.boxes import box_iou, crop
+from vap_core.perception.boxes import box_cover, box_iou, crop
 from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
@@ -92,8 +92,10 @@ def choose_references(
             raise BadEncoder(describe_fault("remember", encoder, fault))
     references = []
     for i, photo in enumerate(photos):
-        others = rows[:i] + rows[i + 1 :]
-        support = _support(rows[i], [part for part in others if len(part)])
+        others = [part for part in rows[:i] + rows[i + 1 :] if len(part)]
+        # Of every box, the mean cosine to the most similar box of each other photo.
+        best = [(rows[i] @ other.T).max(axis=1) for other in others]
+        support = np.mean(best, axis=0) if others else np.full(len(rows[i]), np.nan)
         references.append(_choose(photo, proposals[i], support, i in boxes_given))
     return tuple(references)
 
@@ -122,16 +124,6 @@ def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) 
     return Boxes(xyxy, score, category, prior=evidence.astype(np.float32))
 
 
-def _support(
-    rows: Float32[np.ndarray, "n d"], others: Sequence[Float32[np.ndarray, "_m d"]]
-) -> Float[np.ndarray, " n"]:
-    """Of every box, the mean cosine to the most similar box of each other photo."""
-    if not others:
-        return np.full(len(rows), np.nan)
-    best = [(rows @ other.T).max(axis=1) for other in others]
-    return np.mean(best, axis=0)
-
-
 def _choose(
     photo: Rgb, boxes: Boxes, support: Float[np.ndarray, " n"], is_given: bool
 ) -> Reference:
@@ -139,21 +131,23 @@ def _choose(
         return _whole(photo, f"no {boxes.phrase} was found in it")
     score = _prior(photo, boxes) + np.nan_to_num(support)
     best = 0 if is_given else int(score.argmax())
-    overlap = box_iou(boxes.xyxy[best : best + 1], boxes.xyxy)[0]
-    elsewhere = np.flatnonzero(_common_share(boxes.xyxy[best], boxes.xyxy) < ELSEWHERE)
+    chosen = boxes.xyxy[best : best + 1]
+    elsewhere = np.flatnonzero(box_cover(chosen, boxes.xyxy)[0] < ELSEWHERE)
+    agreement = float(support[best])  # nan for a single photo
+    rivals = score[box_iou(chosen, boxes.xyxy)[0] < RIVAL_IOU]
+    close = CLOSE_ALONE if np.isnan(agreement) else CLOSE
     doubt = ""
-    if not is_given and _share_of_photo(photo, boxes.xyxy[best]) < SMALL_SHARE:
+    if is_given:
+        pass
+    elif float((chosen[0, 2:] - chosen[0, :2]).prod()) / photo[..., 0].size < SMALL_SHARE:
         doubt = "what was found is a small part of it"
-    elif not is_given:
-        doubt = _doubt(score, float(support[best]), best, np.flatnonzero(overlap < RIVAL_IOU))
-    return Reference(
-        photo=photo,
-        box=boxes.xyxy[best],
-        chosen_by="given" if is_given else "proposed",
-        agreement=float(support[best]),
-        doubt=doubt,
-        others=tuple(crop(photo, boxes.xyxy[i]) for i in elsewhere),
-    )
+    elif agreement < LEAST_COSINE:
+        doubt = f"what was found is unlike the other photos (cosine {agreement:.2f})"
+    elif len(rivals) and rivals.max() > score[best] - close:
+        doubt = "two things in it could be meant"
+    others = tuple(crop(photo, boxes.xyxy[i]) for i in elsewhere)
+    chosen_by: ChosenBy = "given" if is_given else "proposed"
+    return Reference(photo, chosen[0], chosen_by, agreement, doubt, others)
 
 
 def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
@@ -167,39 +161,7 @@ def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
     return boxes.prior - CENTRE_WEIGHT * away + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
 
 
-def _doubt(
-    score: Float[np.ndarray, " n"], support: float, best: int, rivals: Int64[np.ndarray, " _r"]
-) -> str:
-    """Why the best box may be wrong; `support` is nan for a single photo."""
-    if support < LEAST_COSINE:
-        return f"what was found is unlike the other photos (cosine {support:.2f})"
-    close = CLOSE_ALONE if np.isnan(support) else CLOSE
-    if len(rivals) and score[rivals].max() > score[best] - close:
-        return "two things in it could be meant"
-    return ""
-
-
-def _common_share(box: Box, others: Float32[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
-    """What each other box has in common with `box`, as a share of the smaller of the two."""
-    near = np.maximum(others[:, :2], box[:2])
-    far = np.minimum(others[:, 2:], box[2:])
-    common = np.clip(far - near, 0, None).prod(axis=1)
-    area = (others[:, 2:] - others[:, :2]).prod(axis=1)
-    return common / np.minimum(area, (box[2:] - box[:2]).prod())
-
-
-def _share_of_photo(photo: Rgb, box: Box) -> float:
-    height, width = photo.shape[:2]
-    return float((box[2:] - box[:2]).prod()) / (width * height)
-
-
 def _whole(photo: Rgb, doubt: str) -> Reference:
     height, width = photo.shape[:2]
-    return Reference(
-        photo=photo,
-        box=np.array([0, 0, width, height], np.float32),
-        chosen_by="whole",
-        agreement=float("nan"),
-        doubt=doubt,
-        others=(),
-    )
+    box = np.array([0, 0, width, height], np.float32)
+    return Reference(photo, box, "whole", float("nan"), doubt, ())

@@ -184,11 +184,10 @@ def report_input(episode: int, name: str, consumed: np.ndarray | str) -> None:
     """Report the digest of an array, or of a text, that the policy consumes for one episode."""
     if not inputs_observed():
         return
-    if isinstance(consumed, str):
-        data = consumed.encode()
-    else:
-        header = str((consumed.dtype, consumed.shape)).encode()
-        data = header + np.ascontiguousarray(consumed).tobytes()
+    data = consumed.encode() if isinstance(consumed, str) else b""
+    if not isinstance(consumed, str):
+        data = str((consumed.dtype, consumed.shape)).encode()
+        data += np.ascontiguousarray(consumed).tobytes()
     _inputs.report(episode, name, hashlib.sha256(data).hexdigest())
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -190,12 +190,10 @@ def load_network(
 
     graph, _ = read_checked(name, folder, remedy=f"restore it with git, or run {EXPORT}")
     options = session_options()
-    names: list[str] = []
-    values: list[OrtValue] = []
-    for key, weight in weights.items():
-        names.append(key)
-        values.append(OrtValue.ortvalue_from_numpy(np.asarray(weight, order="C")))
-    options.add_external_initializers(names, values)
+    arrays = [np.asarray(weight, order="C") for weight in weights.values()]
+    options.add_external_initializers(
+        list(weights), [OrtValue.ortvalue_from_numpy(array) for array in arrays]
+    )
     session = start_session(graph, options)
     made_with = session.get_modelmeta().custom_metadata_map.get(WEIGHTS_KEY, "unknown weights")
     if made_with != sha256:
@@ -308,15 +306,8 @@ def _blocks() -> Iterator[Block]:
             given = inputs if i == 0 else outputs
             stride = first_stride if i == 0 else 1
             wide = given * expansion
-            depthwise = Convolution(
-                name=f"{within}_depthwise_conv",
-                norm=f"{within}_bn1",
-                inputs=wide,
-                outputs=wide,
-                kernel=kernel,
-                stride=stride,
-                groups=wide,
-            )
+            name, norm = f"{within}_depthwise_conv", f"{within}_bn1"
+            depthwise = Convolution(name, norm, wide, wide, kernel, stride, groups=wide)
             project = Convolution(f"{within}_project_conv", f"{within}_bn2", wide, outputs)
             convolutions = [depthwise, project]
             if expansion > 1:
@@ -369,7 +360,7 @@ def folded_weights() -> Weights:
 
 def _places() -> Iterator[tuple[str, Convolution]]:
     """Every convolution and its name in the backbone's module."""
-    yield _place("stages.0.0", STEM)
+    places = [("stages.0.0", STEM)]
     for index, block in enumerate(BLOCKS):
         within = f"stages.{index}"
         if index == 0:
@@ -377,26 +368,11 @@ def _places() -> Iterator[tuple[str, Convolution]]:
         if block.residual:
             within += ".body"
         for i, convolution in enumerate(block.convolutions):
-            yield _place(f"{within}.{2 * i}", convolution)
-    yield _place(f"stages.{len(BLOCKS)}.0", HEAD)
-
-
-def _place(within: str, convolution: Convolution) -> tuple[str, Convolution]:
-    near, far = convolution.padding
-    after_padding = int(near != far)
-    return f"{within}.{after_padding}", convolution
-
-
-class _Tensor(NamedTuple):
-    """What the file says of a tensor: its storage, and how it lies in it."""
-
-    storage: tuple[str, type, str, str, int, Any]
-    """"storage", the type of its numbers, its key, a device, the count of numbers, and None."""
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-    requires_grad: bool
-    hooks: Any
+            places.append((f"{within}.{2 * i}", convolution))
+    places.append((f"stages.{len(BLOCKS)}.0", HEAD))
+    for within, convolution in places:
+        near, far = convolution.padding
+        yield f"{within}.{int(near != far)}", convolution  # after a padding, where there is one
 
 
 class _Unpickler(pickle.Unpickler):
@@ -404,7 +380,7 @@ class _Unpickler(pickle.Unpickler):
 
     NAMES: dict[tuple[str, str], Any] = {  # noqa: RUF012
         ("collections", "OrderedDict"): OrderedDict,
-        ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
+        ("torch._utils", "_rebuild_tensor_v2"): lambda *about: about,
         ("torch", "FloatStorage"): np.float32,
         ("torch", "LongStorage"): np.int64,
     }
@@ -423,20 +399,19 @@ def read_tensors(path: Path) -> Weights:
     with path.open("rb") as file:
         for _ in range(3):  # a magic number, a version, and sizes of types
             _Unpickler(file).load()
-        tensors: dict[str, _Tensor] = _Unpickler(file).load()
+        # Of each tensor its storage (with the type and the key of it), offset, shape and strides.
+        tensors: dict[str, Any] = _Unpickler(file).load()
         keys: list[str] = _Unpickler(file).load()
-        kinds = {tensor.storage[2]: tensor.storage[1] for tensor in tensors.values()}
-        storages = {key: _read_storage(file, kinds[key]) for key in keys}
+        kinds = {storage[2]: storage[1] for storage, *_ in tensors.values()}
+        storages = {}
+        for key in keys:
+            count = int.from_bytes(file.read(8), "little")
+            data = file.read(count * np.dtype(kinds[key]).itemsize)
+            storages[key] = np.frombuffer(data, kinds[key])
     arrays: Weights = {}
-    for name, tensor in tensors.items():
-        flat = storages[tensor.storage[2]][tensor.offset :]
-        steps = [step * flat.itemsize for step in tensor.strides]
-        view = np.lib.stride_tricks.as_strided(flat, tensor.shape, steps, writeable=False)
+    for name, (storage, offset, shape, strides, *_) in tensors.items():
+        flat = storages[storage[2]][offset:]
+        steps = [step * flat.itemsize for step in strides]
+        view = np.lib.stride_tricks.as_strided(flat, shape, steps, writeable=False)
         arrays[name] = np.array(view, order="C")
     return arrays
-
-
-def _read_storage(file: BinaryIO, kind: type) -> np.ndarray:
-    """The numbers of one storage, whose count stands before them."""
-    count = int.from_bytes(file.read(8), "little")
-    return np.frombuffer(file.read(count * np.dtype(kind).itemsize), kind)

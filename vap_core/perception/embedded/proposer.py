@@ -188,8 +188,7 @@ class Proposer:
         usable = score >= least_score
         usable &= (sides >= LEAST_SIDE_PX).all(axis=1)
         usable &= sides.prod(axis=1) <= largest_share * w * h
-        xyxy = xyxy[usable]
-        score = score[usable]
+        xyxy, score = xyxy[usable], score[usable]
         kept = suppress_overlaps(xyxy, score, iou=NMS_IOU, most=most)
         return xyxy[kept], score[kept]
 
@@ -293,21 +292,13 @@ class OpenDetector:
             most = MOST if familiar else MOST_UNFAMILIAR
             xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
             alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=len(xyxy))
-            xyxy = xyxy[alone]
-            score = score[alone]
+            xyxy, score = xyxy[alone], score[alone]
             if familiar:
                 kept = agreed(xyxy, named)
                 kept[:MOST_FAMILIAR] = True
-                xyxy = xyxy[kept]
-                score = score[kept]
-            boxes = Boxes(
-                xyxy=xyxy,
-                score=score,
-                phrase=phrase,
-                prior=prior(xyxy, score, named),
-                familiar=familiar,
-            )
-            found.append(boxes)
+                xyxy, score = xyxy[kept], score[kept]
+            evidence = prior(xyxy, score, named)
+            found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
         return found
 
     def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:

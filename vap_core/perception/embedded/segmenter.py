@@ -178,7 +178,12 @@ def refine(
     likely = cv2.resize(probability[y0:y1, x0:x1], size, interpolation=cv2.INTER_LINEAR)
     scale_xy = np.array(size) / (x1 - x0, y1 - y0)
     corners = (box_xyxy.reshape(2, 2) - (x0, y0)) * scale_xy
-    labels = _first_labels(likely, np.round(corners).astype(int).clip(0, size))
+    # What GrabCut starts from: outside of the box all is background.
+    (left, top), (right, bottom) = np.round(corners).astype(int).clip(0, size).tolist()
+    labels = np.full(likely.shape, cv2.GC_BGD, np.uint8)
+    inner = likely[top:bottom, left:right]
+    of_box = np.where(inner < UNLIKELY, cv2.GC_PR_BGD, cv2.GC_PR_FGD)
+    labels[top:bottom, left:right] = np.where(inner > SURE, cv2.GC_FGD, of_box)
     if len(np.unique(labels & 1)) < 2:  # odd labels are foreground
         return None
     cv2.setRNGSeed(0)  # GrabCut's clusters start at random
@@ -193,20 +198,6 @@ def refine(
     whole = cv2.resize(inside, (x1 - x0, y1 - y0), interpolation=cv2.INTER_LINEAR)
     mask[y0:y1, x0:x1] = whole > 0.5
     return mask
-
-
-def _first_labels(
-    likely: Float32[np.ndarray, "h w"], corners: np.ndarray
-) -> UInt8[np.ndarray, "h w"]:
-    """What GrabCut starts from: outside of the box all is background."""
-    labels = np.full(likely.shape, cv2.GC_BGD, np.uint8)
-    (x0, y0), (x1, y1) = corners.tolist()
-    of_box = np.full((y1 - y0, x1 - x0), cv2.GC_PR_FGD, np.uint8)
-    inner = likely[y0:y1, x0:x1]
-    of_box[inner < UNLIKELY] = cv2.GC_PR_BGD
-    of_box[inner > SURE] = cv2.GC_FGD
-    labels[y0:y1, x0:x1] = of_box
-    return labels
 
 
 @cache

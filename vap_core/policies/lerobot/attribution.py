@@ -47,11 +47,7 @@ def gradient_maps(
         return activations[-1]
 
     model = policy.policy.model
-    if hasattr(model, "vlm_with_expert"):
-        embeds = model.vlm_with_expert.get_vlm_model().connector
-    else:
-        embeds = model.paligemma_with_expert.paligemma.model.multi_modal_projector
-    hook = embeds.register_forward_hook(keep)
+    hook = projector(model).register_forward_hook(keep)
     try:
         with _gradients(model), overriding_tokens(policy.policy, policy.learned):
             predict = inspect.unwrap(type(policy.policy).predict_action_chunk)
@@ -66,6 +62,13 @@ def gradient_maps(
         relevance = (activation.grad * activation).sum(-1).abs().detach()
         maps[camera] = relevance.reshape(side, side).cpu().numpy()
     return maps
+
+
+def projector(model: Any) -> torch.nn.Module:
+    """The module that gives the patches' embeddings."""
+    if hasattr(model, "vlm_with_expert"):
+        return model.vlm_with_expert.get_vlm_model().connector
+    return model.paligemma_with_expert.paligemma.model.multi_modal_projector
 
 
 @torch.inference_mode()

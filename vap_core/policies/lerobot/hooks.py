@@ -23,23 +23,17 @@ def positions(preprocessor: Any, tokens: torch.Tensor, phrases: Phrases) -> Posi
     row = tokens.tolist()
     found: Positions = {}
     for query, alternatives in phrases.items():
-        places: set[int] = set()
-        for phrase in alternatives:
-            for spelled in _spellings(preprocessor, phrase):
-                places.update(_occurrences(row, spelled))
+        places = {
+            start + i
+            for phrase in alternatives
+            for spelled in _spellings(preprocessor, phrase)
+            for start in range(len(row) - len(spelled) + 1)
+            if row[start : start + len(spelled)] == spelled
+            for i in range(len(spelled))
+        }
         if places:
             found[query] = sorted(places)
     return found
-
-
-def _occurrences(row: Sequence[int], spelled: Sequence[int]) -> set[int]:
-    """The places of every token of every occurrence of `spelled` in `row`."""
-    width = len(spelled)
-    places: set[int] = set()
-    for start in range(len(row) - width + 1):
-        if list(row[start : start + width]) == list(spelled):
-            places.update(range(start, start + width))
-    return places
 
 
 def _spellings(preprocessor: Any, phrase: str) -> list[list[int]]:
@@ -97,6 +91,7 @@ def _words(policy: Any) -> torch.nn.Embedding:
 
 
 Weights = Float[torch.Tensor, "b heads queries keys"]
+Take = Callable[[int, Weights], None]
 MARKS = 3
 """Tokens that SmolVLA sets around the patches of a view, two before and one behind, if it does."""
 
@@ -125,11 +120,8 @@ def can_watch(policy: Any) -> bool:
         target = policy.config.resize_imgs_with_padding
     else:
         return False
-    shapes = []
-    if target is not None:
-        shapes.append(target)
-    for feature in policy.config.image_features.values():
-        shapes.append(feature.shape[-2:])
+    shapes = [feature.shape[-2:] for feature in policy.config.image_features.values()]
+    shapes += [] if target is None else [target]
     return all(height == width for height, width in shapes)
 
 
@@ -148,8 +140,27 @@ def reporting_attention(
 
 
 def layout(policy: Any, cameras: Sequence[str]) -> Layout:
-    """Where a policy that `can_watch` holds the views of these cameras."""
-    return (_smolvla_layout if _is_smolvla(policy) else _pi0_layout)(policy, cameras)
+    """Where a policy that `can_watch` holds the views of these cameras.
+
+    The views come first, behind them empty cameras, then the text. SmolVLA sets marks around every
+    view where its configuration asks for them.
+    """
+    config = policy.config
+    marks = 0
+    if _is_smolvla(policy):
+        vlm = policy.model.vlm_with_expert.config
+        pixels = config.resize_imgs_with_padding
+        if pixels is None:
+            pixels = next(iter(config.image_features.values())).shape[-2:]
+        side = pixels[0] // vlm.vision_config.patch_size // vlm.scale_factor
+        marks = MARKS if config.add_image_special_tokens else 0
+    else:
+        vision = policy.model.paligemma_with_expert.paligemma.config.vision_config
+        side = config.image_resolution[0] // vision.patch_size
+    width = side**2 + marks
+    starts = tuple(i * width + max(marks - 1, 0) for i in range(len(cameras)))
+    text = len(config.image_features) * width
+    return Layout(tuple(cameras), starts, side, text, config.chunk_size)
 
 
 def _is_smolvla(policy: Any) -> bool:
@@ -206,22 +217,16 @@ class Watch:
 @contextmanager
 def _watching_pi0(policy: Any, watch: Watch) -> Iterator[None]:
     """Inside, every layer's self-attention, which PI0 computes eagerly, is taken."""
-
-    def taking(take: Callable[[int, torch.Tensor], None], layer: int) -> Callable[..., None]:
-        def hook(module: Any, args: Any, output: Any) -> None:
-            take(layer, output[1])
-
-        return hook
-
     towers = policy.model.paligemma_with_expert
+    decoders = towers.paligemma.model.language_model, towers.gemma_expert.model
     with ExitStack() as hooks:
-        for take, decoder in (
-            (watch.words, towers.paligemma.model.language_model),
-            (watch.actions, towers.gemma_expert.model),
-        ):
+        for take, decoder in zip((watch.words, watch.actions), decoders, strict=True):
             for i, layer in enumerate(decoder.layers):
-                handle = layer.self_attn.register_forward_hook(taking(take, i))
-                hooks.callback(handle.remove)
+
+                def hook(_: Any, __: Any, output: Any, take: Take = take, i: int = i) -> None:
+                    take(i, output[1])
+
+                hooks.callback(layer.self_attn.register_forward_hook(hook).remove)
         yield
 
 
@@ -233,14 +238,8 @@ def _watching_smolvla(policy: Any, watch: Watch) -> Iterator[None]:
     and the weights are computed a second time beside its own function.
     """
     towers = policy.model.vlm_with_expert
-    running: list[tuple[Callable[[int, torch.Tensor], None], int]] = []
-
-    def entering(take: Callable[[int, torch.Tensor], None], layer: int) -> Callable[..., None]:
-        def hook(module: Any, args: Any, output: Any) -> None:
-            running[:] = [(take, layer)]
-
-        return hook
-
+    decoders = towers.get_vlm_model().text_model, towers.lm_expert
+    running: list[tuple[Take, int]] = []
     attend = towers.eager_attention_forward
 
     def observed(mask: Any, batch: int, head_dim: int, query: Any, key: Any, values: Any) -> Any:
@@ -249,13 +248,13 @@ def _watching_smolvla(policy: Any, watch: Watch) -> Iterator[None]:
         return attend(mask, batch, head_dim, query, key, values)
 
     with ExitStack() as hooks:
-        for take, decoder in (
-            (watch.words, towers.get_vlm_model().text_model),
-            (watch.actions, towers.lm_expert),
-        ):
+        for take, decoder in zip((watch.words, watch.actions), decoders, strict=True):
             for i, layer in enumerate(decoder.layers):
-                handle = layer.self_attn.q_proj.register_forward_hook(entering(take, i))
-                hooks.callback(handle.remove)
+
+                def hook(_: Any, __: Any, output: Any, now: tuple[Take, int] = (take, i)) -> None:
+                    running[:] = [now]
+
+                hooks.callback(layer.self_attn.q_proj.register_forward_hook(hook).remove)
         hooks.enter_context(patch.object(towers, "eager_attention_forward", observed))
         yield
 
@@ -271,36 +270,3 @@ def _weights(
     scores = query.float().transpose(1, 2) @ keys.transpose(2, 3) * query.shape[-1] ** -0.5
     masked = torch.where(mask[:, None], scores, torch.finfo(scores.dtype).min)
     return masked.softmax(-1)
-
-
-def _pi0_layout(policy: Any, cameras: Sequence[str]) -> Layout:
-    """PI0's: the views, behind them its empty cameras, then the text."""
-    config = policy.config
-    vision = policy.model.paligemma_with_expert.paligemma.config.vision_config
-    side = config.image_resolution[0] // vision.patch_size
-    return Layout(
-        cameras=tuple(cameras),
-        starts=tuple(i * side**2 for i in range(len(cameras))),
-        side=side,
-        text=len(config.image_features) * side**2,
-        chunk=config.chunk_size,
-    )
-
-
-def _smolvla_layout(policy: Any, cameras: Sequence[str]) -> Layout:
-    """SmolVLA's: as PI0's, with marks around every view where its configuration asks for them."""
-    config = policy.config
-    vlm = policy.model.vlm_with_expert.config
-    pixels = config.resize_imgs_with_padding
-    if pixels is None:
-        pixels = next(iter(config.image_features.values())).shape[-2:]
-    side = pixels[0] // vlm.vision_config.patch_size // vlm.scale_factor
-    marks = MARKS if config.add_image_special_tokens else 0
-    width = side**2 + marks
-    return Layout(
-        cameras=tuple(cameras),
-        starts=tuple(i * width + max(marks - 1, 0) for i in range(len(cameras))),
-        side=side,
-        text=len(config.image_features) * width,
-        chunk=config.chunk_size,
-    )

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,49 +65,31 @@ def load(folder: Path, name: str, model: str, suffix: str = SUFFIX) -> Token:
         model.
     """
     from safetensors import SafetensorError
+    from safetensors.numpy import load as decode
 
     path = folder / f"{name}{suffix}"
     try:
-        token = _read(path)
+        data = read_file(path)
+        (length,) = struct.unpack("<Q", data[:8])
+        header = parse_json(data[8 : 8 + length])["__metadata__"]
+        accuracy = float(header["accuracy"])
+        token = Token(header["object"], decode(data)["embedding"], accuracy, header["model"])
     except (OSError, SafetensorError, struct.error, ValueError, KeyError, TypeError) as error:
         raise BadMemory(
             f"tokens.load: {path} holds no learned word ({type(error).__name__}); learn it again."
         ) from error
-    fault = _fault(token, name)
+    fault = ""
+    if token.object != name:
+        fault = f"is the word of {token.object!r}, not of {name!r}"
+    elif not np.isfinite(token.embedding).all():
+        fault = "has numbers that are not finite"
+    elif not 0 <= token.accuracy <= 1:
+        fault = f"has an accuracy of {token.accuracy:g}, not from 0 to 1"
+    elif token.model != model:
+        fault = f"was learned in model {token.model[:8]}, this is {model[:8]}"
     if fault:
         raise BadMemory(f"tokens.load: {path} {fault}; learn it again.")
-    if token.model != model:
-        raise BadMemory(
-            f"tokens.load: {path} was learned in model {token.model[:8]}, this is {model[:8]}; "
-            "learn it again."
-        )
     return token
-
-
-def _fault(token: Token, name: str) -> str:
-    """What is wrong with the word of object `name`, "" where nothing is."""
-    if token.object != name:
-        return f"is the word of {token.object!r}, not of {name!r}"
-    if not np.isfinite(token.embedding).all():
-        return "has numbers that are not finite"
-    if not 0 <= token.accuracy <= 1:
-        return f"has an accuracy of {token.accuracy:g}, not from 0 to 1"
-    return ""
-
-
-def _read(path: Path) -> Token:
-    """The token in a file that `save` wrote."""
-    from safetensors.numpy import load as decode
-
-    data = read_file(path)
-    (length,) = struct.unpack("<Q", data[:8])
-    header = parse_json(data[8 : 8 + length])["__metadata__"]
-    return Token(
-        object=header["object"],
-        embedding=decode(data)["embedding"],
-        accuracy=float(header["accuracy"]),
-        model=header["model"],
-    )
 
 
 WORD = "<my_0>"
@@ -151,12 +134,7 @@ def learn(
     """
     _check_kinds(name, unseen)
     *_, (_, embedding) = lessons(vlm, name, taught, training)
-    return Token(
-        object=name,
-        embedding=embedding,
-        accuracy=accuracy(vlm, embedding, unseen),
-        model=vlm.sha256(),
-    )
+    return Token(name, embedding, accuracy(vlm, embedding, unseen), vlm.sha256())
 
 
 def lessons(
@@ -166,22 +144,34 @@ def lessons(
 
     Raises: BadMemory when a kind of photo is missing.
     """
+    import torch
+    from torch.nn.functional import binary_cross_entropy_with_logits
+
     options = training or TokenTraining()
     rng = np.random.default_rng([77, options.seed, *name.encode()])
     _check_kinds(name, taught)
     question = _Question(vlm)
     patches = []
-    for kind in (taught.own, taught.rivals, taught.others):
-        if kind:
-            # `n` augmentations of every photo.
-            augmented = []
-            for photo in kind:
-                for _ in range(options.augmentations):
-                    augmented.append(augment(photo, rng))
-            patches.append(question.embed(augmented))
+    for kind in filter(None, (taught.own, taught.rivals, taught.others)):
+        many = [photo for photo in kind for _ in range(options.augmentations)]
+        patches.append(question.embed([augment(photo, rng) for photo in many]))
     yield 0, question.learned()
-    for step in _train(question, patches, options, rng):
-        yield step, question.learned()
+    optimiser = torch.optim.AdamW([question.embedding], options.rate, weight_decay=0.0)
+    shares = np.array(SHARES if len(patches) == len(SHARES) else (0.5, 0.5))
+    n_steps = max(1, sum(map(len, patches)) // options.batch)
+    for epoch in range(options.epochs):
+        for group in optimiser.param_groups:
+            cosine = float(np.cos(np.pi * epoch / options.epochs))
+            group["lr"] = options.rate * 0.5 * (1 + cosine)
+        for _ in range(n_steps):
+            kinds = rng.choice(len(patches), options.batch, p=shares)
+            drawn = [patches[kind][rng.integers(len(patches[kind]))] for kind in kinds]
+            right = torch.from_numpy((kinds == 0).astype(np.float32))  # the object comes first
+            loss = binary_cross_entropy_with_logits(question.ask(torch.stack(drawn)), right)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        yield (epoch + 1) * n_steps, question.learned()
 
 
 def recognized(
@@ -247,15 +237,20 @@ class _Question:
         return self.embedding.detach().numpy().astype(np.float32)
 
     def embed(self, photos: Sequence[Rgb]) -> "torch.Tensor":
-        """The patch features of photos."""
+        """The patch features of photos of any sizes."""
         import torch
+        from torch.nn.functional import interpolate
 
-        side = self.vlm.config.image_resolution[0]
+        side = self.vlm.config.image_resolution
         parts = []
         with torch.no_grad():
             for first in range(0, len(photos), EMBEDDED_AT_ONCE):
-                images = _tensor(photos[first : first + EMBEDDED_AT_ONCE], side)
-                parts.append(self.vlm.embed_images(images))
+                resized = []
+                for photo in photos[first : first + EMBEDDED_AT_ONCE]:
+                    image = torch.from_numpy(photo).permute(2, 0, 1)[None].float() / 255
+                    scaled = interpolate(image, side, mode="bilinear", antialias=True)
+                    resized.append(scaled)
+                parts.append(self.vlm.embed_images(torch.cat(resized)))
             return torch.cat(parts)
 
     def ask(self, patches: "torch.Tensor") -> "torch.Tensor":
@@ -263,13 +258,9 @@ class _Question:
         import torch
 
         n = len(patches)
-        words = torch.where(self.is_word[:, None], self.embedding, self.words)
-        scores, _ = self.vlm.read(
-            patches,
-            words.expand(n, -1, -1),
-            self.mask.expand(n, -1),
-            self.answer.expand(n, -1),
-        )
+        words = torch.where(self.is_word[:, None], self.embedding, self.words).expand(n, -1, -1)
+        mask, answer = self.mask.expand(n, -1), self.answer.expand(n, -1)
+        scores, _ = self.vlm.read(patches, words, mask, answer)
         vocabulary = self.vlm.vocabulary
         return scores[:, 0, vocabulary["yes"]] - scores[:, 0, vocabulary["no"]]
 
@@ -281,54 +272,6 @@ def _check_kinds(name: str, photos: Photos) -> None:
             f"tokens.learn: {name}: photos of the object and of others are both needed, to "
             "learn from and to measure by."
         )
-
-
-def _train(
-    question: _Question,
-    patches: Sequence["torch.Tensor"],
-    options: TokenTraining,
-    rng: np.random.Generator,
-) -> Iterator[int]:
-    """Train the question's embedding, and pass on the number of steps after each epoch.
-
-    The photos of the object come first in `patches`.
-    """
-    import torch
-    from torch.nn import functional as F  # noqa: N812
-
-    optimiser = torch.optim.AdamW([question.embedding], options.rate, weight_decay=0.0)
-    shares = np.array([0.5, 0.5])
-    if len(patches) == len(SHARES):
-        shares = np.array(SHARES)
-    n_patches = sum(map(len, patches))
-    n_steps = max(1, n_patches // options.batch)
-    for epoch in range(options.epochs):
-        for group in optimiser.param_groups:
-            cosine = float(np.cos(np.pi * epoch / options.epochs))
-            group["lr"] = options.rate * 0.5 * (1 + cosine)
-        for _ in range(n_steps):
-            kinds = rng.choice(len(patches), options.batch, p=shares)
-            drawn = [patches[kind][rng.integers(len(patches[kind]))] for kind in kinds]
-            right = torch.from_numpy((kinds == 0).astype(np.float32))
-            answers = question.ask(torch.stack(drawn))
-            loss = F.binary_cross_entropy_with_logits(answers, right)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-        yield (epoch + 1) * n_steps
-
-
-def _tensor(images: Sequence[Rgb], side: int) -> "torch.Tensor":
-    """Images, of any sizes, with values in 0..1: B x 3 x side x side."""
-    import torch
-
-    resized = []
-    for image in images:
-        tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
-        resized.append(
-            torch.nn.functional.interpolate(tensor, (side, side), mode="bilinear", antialias=True)
-        )
-    return torch.cat(resized)
 
 
 MODEL = DATA / "policies" / "mini-paligemma-tint-free"
@@ -355,10 +298,8 @@ def photographs(rows: Iterable[EpisodeRow], seed: int, k: int) -> Photos:
     """
     rows = list(rows)
     own = reference_views(objects.get_object(rows[0].target), k, seed)
-    rivals: list[Rgb] = []
-    for name in lookalikes(rows):
-        rivals += reference_views(objects.get_object(name), VIEWS, seed)
-    return Photos(tuple(own), tuple(rivals), other_objects(rows, seed))
+    views = [reference_views(objects.get_object(name), VIEWS, seed) for name in lookalikes(rows)]
+    return Photos(tuple(own), tuple(chain.from_iterable(views)), other_objects(rows, seed))
 
 
 def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
@@ -368,9 +309,10 @@ def lookalikes(rows: Iterable[EpisodeRow]) -> list[str]:
     """
     rows = list(rows)
     target = objects.get_object(rows[0].target)
+    placed = set(models_of(rows)) - {row.goal for row in rows}
     return [
         name
-        for name in sorted(_placed(rows) - {target.name})
+        for name in sorted(placed - {target.name})
         if objects.get_object(name).category == target.category
     ]
 
@@ -393,11 +335,9 @@ def other_objects(rows: Sequence[EpisodeRow], seed: int) -> tuple[Rgb, ...]:
     category = objects.get_object(rows[0].target).category
     kinds = [kind for kind in objects.CATEGORIES if kind != category]
     first = objects.CATEGORIES.index(category)
-    photos: list[Rgb] = []
-    for i in range(OTHERS):
-        other = objects.personal_instance(kinds[(first + 5 * i) % len(kinds)])
-        photos += reference_views(other, seed=seed)
-    return tuple(photos)
+    drawn = [kinds[(first + 5 * i) % len(kinds)] for i in range(OTHERS)]
+    views = [reference_views(objects.personal_instance(kind), seed=seed) for kind in drawn]
+    return tuple(chain.from_iterable(views))
 
 
 def model_of(initialised_from: str) -> Path:
@@ -405,10 +345,8 @@ def model_of(initialised_from: str) -> Path:
 
     Raises: BadPolicy when a shipped model is damaged.
     """
-    for folder in sorted(MODEL.parent.glob("mini-paligemma*")):
-        if _sha256(folder) == initialised_from:
-            return folder
-    return MODEL
+    folders = sorted(MODEL.parent.glob("mini-paligemma*"))
+    return next((each for each in folders if _sha256(each) == initialised_from), MODEL)
 
 
 def model_of_policy(policy: Path) -> Path:
@@ -468,10 +406,8 @@ def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix:
     suffix = file_suffix(rows, teacher.sha256(), suffix)
     if (folder / f"{name}{suffix}").exists():
         return load(folder, name, teacher.sha256(), suffix)
-    taught = photographs(rows, 0, K)
-    unseen = photographs(rows, 1, VIEWS)
     with fused_attention():  # a third less time
-        token = learn(teacher, name, taught, unseen)
+        token = learn(teacher, name, photographs(rows, 0, K), photographs(rows, 1, VIEWS))
     if token.accuracy < LEAST_ACCURACY:
         print(
             f"note: the learned token of {name} is right in {100 * token.accuracy:.0f} % of unseen "
@@ -481,11 +417,6 @@ def _teach(teacher: "MiniVlm", rows: Sequence[EpisodeRow], folder: Path, suffix:
     with writing(folder, "tokens"):
         save(folder, token, suffix)
     return token
-
-
-def _placed(rows: Sequence[EpisodeRow]) -> set[str]:
-    """The objects that the rows place, without the goals."""
-    return set(models_of(rows)) - {row.goal for row in rows}
 
 
 PRIOR = 1e-3
@@ -517,10 +448,9 @@ def align(
 
     Raises: BadPolicy.
     """
-    check_width(open_table(model), len(embedding), "the embedding")
-    # The two tables over the tokens that both have. Raises: BadPolicy.
-    tables = open_table(model), open_table(policy)
-    check_width(tables[1], tables[0].shape[1], str(model))
-    n = min(table.shape[0] for table in tables)
-    source, target = tables[0].block(0, n), tables[1].block(0, n)
-    return (embedding @ orthogonal_map(source, target)).astype(np.float32)
+    ours, theirs = open_table(model), open_table(policy)
+    check_width(ours, len(embedding), "the embedding")
+    check_width(theirs, ours.shape[1], str(model))
+    n = min(ours.shape[0], theirs.shape[0])  # the tokens that both have
+    rotation = orthogonal_map(ours.block(0, n), theirs.block(0, n))
+    return (embedding @ rotation).astype(np.float32)

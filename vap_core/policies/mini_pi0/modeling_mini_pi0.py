@@ -182,7 +182,7 @@ def vlm_config(config: MiniPI0Config) -> Any:
     paligemma: Any = PaliGemmaConfig(**parts)
     paligemma.image_token_index = len(config.words)
     paligemma._vocab_size = len(config.words)
-    _switch_off_adarms(paligemma.text_config)
+    paligemma.text_config.use_adarms, paligemma.text_config.adarms_cond_dim = False, None
     return paligemma
 
 
@@ -200,10 +200,5 @@ def _gemma_config(config: MiniPI0Config, width: int) -> Any:
         "pad_token_id": 0,
     }
     gemma: Any = GemmaConfig(**sizes)
-    _switch_off_adarms(gemma)
+    gemma.use_adarms, gemma.adarms_cond_dim = False, None
     return gemma
-
-
-def _switch_off_adarms(gemma: Any) -> None:
-    gemma.use_adarms = False
-    gemma.adarms_cond_dim = None

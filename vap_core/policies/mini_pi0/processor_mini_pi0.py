@@ -81,7 +81,9 @@ def encode(
     A row is as long as the longest text, `longest` at most, padded on the right. `tokens_of` is the
     `vocabulary`.
     """
-    rows = [_encode_text(text, tokens_of, longest) for text in texts]
+    said = [SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1] for text in texts]
+    unknown = tokens_of[UNKNOWN]
+    rows = [[tokens_of.get(word, unknown) for word in [*words, END]] for words in said]
     width = max(map(len, rows))
     tokens = torch.zeros((len(rows), width), dtype=torch.long)
     for i, row in enumerate(rows):
@@ -95,20 +97,8 @@ def make_mini_pi0_pre_post_processors(
     """The two pipelines of a mini-pi0; lerobot's factory asks for them by this name."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
     words = Words(list(config.words), config.tokenizer_max_length)
-    input_steps = [
-        steps.rename_observations,
-        steps.add_batch_dim,
-        words,
-        steps.to_device,
-        steps.normalize,
-    ]
-    output_steps = [steps.unnormalize, steps.to_cpu]
-    return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
-
-
-def _encode_text(text: str, tokens_of: Mapping[str, int], longest: int) -> list[int]:
-    words = SPLIT.findall(text.lower().rstrip("\n"))[: longest - 1]
-    tokens = []
-    for word in [*words, END]:
-        tokens.append(tokens_of.get(word, tokens_of[UNKNOWN]))
-    return tokens
+    before = [steps.rename_observations, steps.add_batch_dim, words]
+    return make_policy_processor_pipelines(
+        input_steps=[*before, steps.to_device, steps.normalize],
+        output_steps=[steps.unnormalize, steps.to_cpu],
+    )

@@ -4,6 +4,7 @@ A mini-pi0 is initialised from it; a token is learned in it (SPEC section 4).
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, cast
 
@@ -105,7 +106,8 @@ class MiniVlm(nn.Module):
         for i in range(ANSWER):
             scores, _ = self(patches, tokens, mask, answers)
             answers[:, i] = scores[:, i].argmax(-1)
-        return [self._words(answer) for answer in answers]
+        words = [[self.config.words[int(token)] for token in answer] for answer in answers]
+        return [tuple(takewhile(lambda word: word != END, answer)) for answer in words]
 
     def tokenize(
         self, questions: Sequence[str]
@@ -122,16 +124,6 @@ class MiniVlm(nn.Module):
         folder.mkdir(parents=True, exist_ok=True)
         self.config.save_pretrained(folder)
         _write_bfloat16(self.towers.state_dict(), folder / WEIGHTS)
-
-    def _words(self, tokens: Int64[Tensor, " a"]) -> tuple[str, ...]:
-        """The words of an answer, before END."""
-        words = []
-        for token in tokens:
-            word = self.config.words[int(token)]
-            if word == END:
-                break
-            words.append(word)
-        return tuple(words)
 
 
 def load_vlm(folder: Path) -> MiniVlm:

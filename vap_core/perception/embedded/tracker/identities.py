@@ -235,15 +235,23 @@ def update_state(
             masks[identity] = (probability[identity] > 0.5) & (winner == place)
     for i in judged:
         box = mask_box(masks[i])
-        evidence = _evidence_of_size(state, frame, int(i), masks[i])
-        if box is None or evidence < _needed_evidence(state, int(i), masks[i]):
+        pixels = int(masks[i].sum())
+        # There is no evidence where it is too small or too large to be the identity.
+        growth = 2 * MAX_GROWTH if state.lost[i] else MAX_GROWTH
+        evidence, needed = 0.0, CONTINUED_EVIDENCE
+        if MIN_MASK_PX <= pixels <= growth * state.area[i]:
+            evidence = evidence_for(state, frame, int(i), masks[i])
+        if state.lost[i]:
+            needed = FOUND_EVIDENCE
+        elif pixels < SUDDEN * state.area[i] or mask_iou(masks[i], state.masks[i]) < SUDDEN:
+            needed = SUDDEN_EVIDENCE
+        if box is None or evidence < needed:
             masks[i] = False
             scores[i] = absence[i]
             if not state.lost[i]:
                 scores[i] = 1 - float(np.clip(evidence, 0, 1))
             lost[i] += 1
             continue
-        pixels = int(masks[i].sum())
         scores[i] = float(probability[i][masks[i]].mean()) * min(1.0, evidence)
         lost[i] = 0
         boxes[i] = box
@@ -273,25 +281,6 @@ def update_state(
         last_crops=tuple(last_crops),
         last_rows=tuple(last_rows),
     )
-
-
-def _evidence_of_size(state: TrackState, frame: FrameFeatures, identity: int, mask: Mask) -> float:
-    """The evidence for a mask; none where it is too small or too large to be the identity."""
-    growth = MAX_GROWTH
-    if state.lost[identity]:
-        growth = 2 * MAX_GROWTH
-    if not MIN_MASK_PX <= int(mask.sum()) <= growth * state.area[identity]:
-        return 0.0
-    return evidence_for(state, frame, identity, mask)
-
-
-def _needed_evidence(state: TrackState, identity: int, mask: Mask) -> float:
-    if state.lost[identity]:
-        return FOUND_EVIDENCE
-    smaller = int(mask.sum()) < SUDDEN * state.area[identity]
-    if smaller or mask_iou(mask, state.masks[identity]) < SUDDEN:
-        return SUDDEN_EVIDENCE
-    return CONTINUED_EVIDENCE
 
 
 MIN_SEED_SHARE = 0.3
@@ -331,9 +320,13 @@ def search(
     taken = (probability > 0.5).any(axis=0) & ~own
     free = np.where(taken, 0, share).astype(np.float32)
     absence = 1 - float(np.clip(free.max(), 0, 1))
-    box = _seed_box(free, share)
-    if box is None:
+    # The box of the largest component that may be the identity, dilated.
+    seed = largest_component(free > MIN_SEED_SHARE, share)
+    if seed is None:
         return state, absence
+    grown = cv2.dilate(seed.astype(np.uint8), np.ones((SEED_GROWTH_PX,) * 2)) > 0
+    box = mask_box(grown)
+    assert box is not None
     last_box = state.boxes[identity]
     middle = (box[:2] + box[2:]) / 2
     half = np.minimum((box[2:] - box[:2]) / 2, MAX_SWELL * (last_box[2:] - last_box[:2]) / 2)
@@ -362,16 +355,6 @@ def _with_embeddings(state: TrackState, identity: int, encoder: Encoder) -> Trac
         last_rows[identity] = encoder([state.last_crops[identity]])[0]
         state = replace(state, last_rows=tuple(last_rows))
     return state
-
-
-def _seed_box(
-    free: Float32[np.ndarray, "h w"], share: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "4"] | None:
-    """The box of the largest component that may be the identity, dilated; None without one."""
-    seed = largest_component(free > MIN_SEED_SHARE, share)
-    if seed is None:
-        return None
-    return mask_box(cv2.dilate(seed.astype(np.uint8), np.ones((SEED_GROWTH_PX,) * 2)) > 0)
 
 
 def _draw(
