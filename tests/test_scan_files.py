@@ -8,6 +8,7 @@ from PIL import Image
 from tests.scanned import BLUE, EPS, RED, box, fake_ghostscript, mug, put
 from vap_core.base.errors import BadObject
 from vap_core.simulation.assets.scans import import_scan as importing
+from vap_core.simulation.assets.scans.gltf import to_linear
 from vap_core.simulation.assets.scans.import_scan import import_scan
 from vap_core.simulation.assets.scans.mesh_file import pack_charts, read_mesh_file
 from vap_core.simulation.assets.shapes import Hull
@@ -134,7 +135,7 @@ def test_a_colourless_mesh_asks_for_a_colour(tmp_path, quick):
     mug().export(tmp_path / "mug.obj")
     for beside in ("material.mtl", "material_0.png"):
         (tmp_path / beside).unlink()
-    with pytest.raises(BadObject, match=r"an OBJ needs its \.mtl and picture beside it"):
+    with pytest.raises(BadObject, match="refers to 'material.mtl', and there is no such file"):
         import_scan(tmp_path / "mug.obj", "mug", "cup", report=ignore)
     _, scan = import_scan(file, "plain", "box", colour="#aa3322", report=ignore)
     assert (scan.image == (0xAA, 0x33, 0x22)).all()
@@ -227,14 +228,17 @@ def test_parts_of_several_colours_become_one_object(tmp_path, quick):
     lower, upper = box(), box()
     for part, rgb in ((lower, RED), (upper, BLUE)):
         part.visual = trimesh.visual.TextureVisuals(
-            material=trimesh.visual.material.PBRMaterial(baseColorFactor=[*rgb, 255])
+            material=trimesh.visual.material.PBRMaterial(
+                baseColorFactor=[*to_linear(np.array(rgb) / 255), 1.0]
+            )
         )
     scene.add_geometry(lower)
     scene.add_geometry(upper, transform=trimesh.transformations.translation_matrix((0, 0.1, 0)))
     _, scan = import_scan(put(tmp_path, "two.glb", scene), "two", "box", report=ignore)
     assert np.ptp(scan.form.vertex, axis=0) == pytest.approx((0.06, 0.08, 0.15), abs=1e-6)
     found, count = np.unique(scan.image.reshape(-1, 3), axis=0, return_counts=True)
-    assert {tuple(map(int, rgb)) for rgb in found[np.argsort(-count)[:2]]} == {RED, BLUE}
+    most = sorted(map(tuple, found[np.argsort(-count)[:2]].astype(int)))
+    assert np.abs(np.array(most) - sorted([RED, BLUE])).max() <= 8  # trimesh writes a byte of light
 
 
 def test_the_up_axis_is_guessed_from_where_it_stands_flat(tmp_path, quick):

@@ -4,8 +4,10 @@ A surface without a usable texture gets a new one: it is unfolded into flat char
 packed, and every texel gets the colour of the nearest coloured point.
 """
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +18,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from vap_core.base.errors import BadObject
-from vap_core.base.media import MAX_PIXELS, PICTURE_FORMATS
+from vap_core.base.media import BEHIND, MAX_PIXELS, PICTURE_FORMATS
 from vap_core.base.types import Rgb, value
+from vap_core.simulation.assets.scans.gltf import multiply, plain_glb
 from vap_core.simulation.assets.shapes import Faces, Mesh, Vertices, area_vectors
 
 if TYPE_CHECKING:
@@ -87,7 +90,7 @@ def read_mesh_file(path: Path, colour: str | None = None) -> ScannedSurface:
 
 
 def _read_surface(path: Path, colour: str | None) -> ScannedSurface:
-    parts = _load_parts(path)
+    parts = _load_parts(path, colour)
     corner = np.concatenate([np.asarray(part.triangles, np.float64) for part in parts])
     if not np.isfinite(corner).all():
         raise BadObject(f"objects: {path} has vertices that are not numbers; export it again.")
@@ -103,23 +106,34 @@ def _read_surface(path: Path, colour: str | None) -> ScannedSurface:
     point, rgb = _sample_colours(path, corner, parts, colour)
     visual: Any = parts[0].visual
     picture = _texture_picture(visual)
-    if len(parts) > 1 or colour is not None or picture is None:
+    one = len(parts) == 1 and "color" not in getattr(visual, "vertex_attributes", {})
+    if not one or colour is not None or picture is None:
         return ScannedSurface(vertex, face, point, rgb)
     uv = (np.asarray(visual.uv, np.float64) * (1, -1) + (0, 1))[parts[0].faces][alive]
     return ScannedSurface(vertex, face, point, rgb, uv, picture)
 
 
-def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
+def _load_parts(path: Path, colour: str | None) -> "list[trimesh.Trimesh]":
     """The file's meshes that have triangles, in one frame.
 
-    Raises: BadObject: there is none, there are too many, or they are inconsistent.
+    Raises: BadObject: there is none, there are too many, they are inconsistent, or a file that they
+        refer to is not there, and no `colour` stands in.
     """
     import trimesh
 
-    with _checked_pictures() as refused:
-        scene = trimesh.load_scene(path, resolver=_beside(path))
+    kind = path.suffix.lower().removeprefix(".")
+    source = BytesIO(plain_glb(path)) if kind == "glb" else path
+    missing: list[str] = []
+    with _checked_pictures() as refused, _silent():
+        resolver = _beside(path, missing, refused)
+        scene = trimesh.load_scene(source, file_type=kind, resolver=resolver)
     if refused:
         raise BadObject(f"objects: {path} has a texture that {refused[0]}.")
+    if missing and colour is None:
+        raise BadObject(
+            f"objects: {path} refers to {missing[0]!r}, and there is no such file beside it; put "
+            "it there, or pass --colour '#aa3322'."
+        )
     meshes = {
         name: mesh
         for name, mesh in scene.geometry.items()
@@ -146,23 +160,77 @@ def _load_parts(path: Path) -> "list[trimesh.Trimesh]":
             f"objects: {path} has {count:,} faces, over {MAX_FACES:,}; decimate it first, a "
             "hundred thousand are plenty."
         )
-    return [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    for part in parts:
+        loaded: Any = scene.geometry[part.metadata["name"]].visual
+        copied: Any = part.visual
+        if "color" in getattr(loaded, "vertex_attributes", {}):  # a copy forgets it
+            copied.vertex_attributes["color"] = loaded.vertex_attributes["color"]
+    return parts
 
 
-def _beside(path: Path) -> "FilePathResolver":
-    """Opens what the mesh refers to: regular files in its folder and below, of MAX_MB at most."""
+def _beside(path: Path, missing: list[str], refused: list[str]) -> "FilePathResolver":
+    """Opens what the mesh refers to: regular files in its folder and below, of MAX_MB at most.
+
+    What is not there is added to `missing`, what is not read here to `refused`.
+    """
     from trimesh.resolvers import FilePathResolver
 
     class Bounded(FilePathResolver):
         def get(self, name: str) -> bytes:
-            for candidate in (name.strip(), Path(name.strip()).name):
+            named = _without_options(name.strip(), refused).replace("\\", "/")
+            for candidate in (named, Path(named).name):
                 with suppress(ValueError):  # outside the folder
                     found = self.absolute(candidate)
                     if found.is_file() and found.stat().st_size <= MAX_MB * 1e6:
                         return found.read_bytes()
-            raise FileNotFoundError(name)
+            missing.append(named)
+            raise FileNotFoundError(named)
 
     return Bounded(str(path))
+
+
+MAP_OPTIONS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
+"""How many numbers follow an option of a picture in an .mtl file, at most; one word else."""
+
+
+def _without_options(name: str, refused: list[str]) -> str:
+    """The file in a line of an .mtl file such as "-s 1 1 1 -clamp on label.png".
+
+    A texture that is moved or scaled is added to `refused`.
+    """
+    words = name.split()
+    while len(words) > 1 and words[0].startswith("-"):
+        option = words.pop(0)
+        values = [words.pop(0)]
+        while len(values) < MAP_OPTIONS.get(option, 1) and len(words) > 1 and _is_number(words[0]):
+            values.append(words.pop(0))
+        unmoved = {"-s": 1.0, "-o": 0.0, "-t": 0.0}.get(option)
+        if unmoved is not None and any(float(value) != unmoved for value in values):
+            refused.append(
+                f"is moved or scaled ({option} {' '.join(values)}), which is not read here; apply "
+                "it in your 3-D tool"
+            )
+        name = " ".join(words)
+    return name
+
+
+def _is_number(word: str) -> bool:
+    with suppress(ValueError):
+        float(word)
+        return True
+    return False
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Inside the block trimesh logs nothing: what it misses is said here, in one line."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 @contextmanager
@@ -214,18 +282,23 @@ def weld(
 
 
 def _texture_picture(visual: Any) -> Rgb | None:
-    """The texture of a part with texture coordinates, tinted as its material says.
+    """The texture of a part with texture coordinates, times its material's factor.
 
-    A texture of 2 x 2 pixels only stands in for a missing file and does not count.
+    Grey stands behind what is transparent, as in photos, unless the material says that it is
+    opaque. A texture of 2 x 2 pixels only stands in for a missing file and does not count.
     """
-    material = getattr(visual, "material", None)
+    material: Any = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or getattr(visual, "uv", None) is None or max(image.size) <= 2:
         return None
-    factor = getattr(material, "baseColorFactor", None)
+    opaque = hasattr(material, "baseColorTexture") and material.alphaMode in (None, "OPAQUE")
+    if image.has_transparency_data and not opaque:
+        grey = Image.new("RGBA", image.size, (BEHIND, BEHIND, BEHIND, 255))
+        image = Image.alpha_composite(grey, image.convert("RGBA"))
     rgb = image.convert("RGB")
+    factor = getattr(material, "baseColorFactor", None)
     if factor is not None:
-        table = np.outer(np.asarray(factor, np.float64)[:3] / 255, np.arange(256))
+        table = multiply(np.arange(256), np.asarray(factor)[:3, None])
         rgb = rgb.point(table.astype(np.uint8).ravel().tolist())
     return np.array(rgb)
 
@@ -276,20 +349,33 @@ def _sample_colours(
 def _colours(
     part: "trimesh.Trimesh", triangle: Int[np.ndarray, " n"], share: Float[np.ndarray, "n 3"]
 ) -> np.ndarray | None:
-    """By a part's texture, its vertices, or its material, at points with barycentric `share`s."""
+    """By a part's texture, its vertices, or its material, at points with barycentric `share`s.
+
+    glTF multiplies them; in other formats the first that is there holds.
+    """
     visual: Any = part.visual
     corner = np.asarray(part.faces)[triangle]
+    material: Any = getattr(visual, "material", None)
+    vertices = getattr(visual, "vertex_attributes", {}).get("color")
+    if visual.kind in ("vertex", "face") and visual.defined:
+        vertices = visual.vertex_colors
+    painted = None
+    if vertices is not None:
+        painted = np.einsum("nk,nkc->nc", share, np.asarray(vertices, np.float64)[:, :3][corner])
     picture = _texture_picture(visual)
     if picture is not None:
         rows, cols, _ = picture.shape
         u, v = np.einsum("nk,nkc->cn", share, np.asarray(visual.uv)[corner])
         row = np.floor((1 - v) % 1 * rows).astype(int) % rows
-        return picture[row, np.floor(u % 1 * cols).astype(int) % cols]
-    if visual.kind in ("vertex", "face") and visual.defined:
-        colours = np.asarray(visual.vertex_colors, np.float64)[:, :3]
-        return np.einsum("nk,nkc->nc", share, colours[corner])
-    flat = getattr(getattr(visual, "material", None), "baseColorFactor", None)
-    return None if flat is None else np.broadcast_to(np.asarray(flat)[:3], (len(triangle), 3))
+        texel = picture[row, np.floor(u % 1 * cols).astype(int) % cols]
+        return texel if painted is None else multiply(texel, painted)
+    flat = getattr(material, "baseColorFactor", None)
+    if flat is None and "kd" in getattr(material, "kwargs", {}):
+        flat = material.diffuse
+    if flat is None:
+        return painted
+    flat = np.broadcast_to(np.asarray(flat)[:3], (len(triangle), 3))
+    return flat if painted is None else multiply(flat, painted)
 
 
 def count_edge_flaws(face: Faces) -> tuple[int, int]:

@@ -1,0 +1,240 @@
+"""The colours of 3-D files: every source that a format has, as the format says it."""
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from tests.command import refused
+from vap_core.base.errors import BadObject
+from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
+
+QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+"""Of a picture: red and green above, blue and yellow below."""
+Scene = dict[str, Any]
+
+
+def body(uv: tuple[float, float] = (0.25, 0.25)) -> trimesh.Trimesh:
+    """A ball of 10 cm whose texture coordinates are all in the middle of one quarter."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    picture = Image.fromarray(QUARTERS.repeat(8, 0).repeat(8, 1))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    spots = np.tile(np.array(uv), (len(mesh.vertices), 1))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=spots, material=material)
+    return mesh
+
+
+def plain() -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 255, 255, 255])
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((len(mesh.vertices), 2)), material=material
+    )
+    return mesh
+
+
+def glb(path: Path, mesh: trimesh.Trimesh, change: Callable[[Scene], object]) -> Path:
+    """The mesh as a GLB file whose header was changed."""
+    data = mesh.export(file_type="glb")
+    (length,) = struct.unpack_from("<I", data, 12)
+    scene = json.loads(data[20 : 20 + length])
+    change(scene)
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest))
+    path.write_bytes(head + struct.pack("<I4s", len(text), b"JSON") + text + rest)
+    return path
+
+
+def surface(scene: Scene) -> dict[str, Any]:
+    found: dict[str, Any] = scene["materials"][0].setdefault("pbrMetallicRoughness", {})
+    return found
+
+
+def factor(*rgba: float) -> Callable[[Scene], object]:
+    return lambda scene: surface(scene).update(baseColorFactor=rgba)
+
+
+def colours(path: Path) -> np.ndarray:
+    return np.unique(read_mesh_file(path).rgb, axis=0)
+
+
+@pytest.mark.parametrize("level", [10, 55, 128, 200, 255])
+def test_a_factor_of_gltf_is_light(tmp_path: Path, level: int) -> None:
+    """Grey 128 became 55, nearly black."""
+    light = ((level / 255 + 0.055) / 1.055) ** 2.4 if level > 10 else level / 255 / 12.92
+    path = glb(tmp_path / "a.glb", plain(), factor(light, light, light, 1))
+    assert np.abs(colours(path).astype(int) - level).max() <= 1
+
+
+def test_a_material_without_a_factor_is_white(tmp_path: Path) -> None:
+    path = glb(tmp_path / "a.glb", plain(), lambda s: surface(s).pop("baseColorFactor", None))
+    assert colours(path).tolist() == [[255, 255, 255]]
+    path = glb(tmp_path / "b.glb", plain(), lambda s: s["materials"][0].clear())
+    assert colours(path).tolist() == [[255, 255, 255]]
+
+
+def test_a_factor_and_a_texture_are_multiplied_as_light(tmp_path: Path) -> None:
+    """The quarter is yellow; half its light in red is 188 of 255."""
+    path = glb(tmp_path / "a.glb", body((0.75, 0.25)), factor(0.5, 1, 1, 1))
+    assert colours(path).tolist() == [[188, 255, 0]]
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_vertex_colours_of_gltf_are_light_and_multiplied(tmp_path: Path, textured: bool) -> None:
+    light = np.array([0.5, 0.21586, 1.0, 1.0], "<f4")
+    mesh = body((0.75, 0.25)) if textured else plain()
+    count = len(mesh.vertices)
+
+    def paint(scene: Scene) -> None:
+        view = {
+            "buffer": 0,
+            "byteOffset": scene["buffers"][0]["byteLength"],
+            "byteLength": 16 * count,
+        }
+        scene["bufferViews"].append(view)
+        scene["accessors"].append(
+            {"bufferView": len(scene["bufferViews"]) - 1, "componentType": 5126,
+             "count": count, "type": "VEC4"}
+        )  # fmt: skip
+        attributes = scene["meshes"][0]["primitives"][0]["attributes"]
+        attributes["COLOR_0"] = len(scene["accessors"]) - 1
+        scene["buffers"][0]["byteLength"] += 16 * count
+
+    path = glb(tmp_path / "a.glb", mesh, paint)
+    path.write_bytes(path.read_bytes() + light.tobytes() * count)
+    expected = np.array([188, 128, 0 if textured else 255])
+    assert np.abs(colours(path).astype(int) - expected).max() <= 1
+
+
+def test_a_texture_transform_and_further_coordinates_are_read(tmp_path: Path) -> None:
+    """Wrong quarters were shown, in silence. (u, v) is (.25, .75) in glTF: v runs down."""
+    where = {"offset": [0.5, -0.5], "scale": [1, 1]}
+
+    def move(scene: Scene) -> None:
+        surface(scene)["baseColorTexture"]["extensions"] = {"KHR_texture_transform": where}
+        scene["extensionsUsed"] = ["KHR_texture_transform"]
+
+    assert colours(glb(tmp_path / "a.glb", body(), lambda s: None)).tolist() == [[0, 0, 255]]
+    assert colours(glb(tmp_path / "b.glb", body(), move)).tolist() == [[0, 255, 0]]
+
+    def second(scene: Scene) -> None:
+        attributes = scene["meshes"][0]["primitives"][0]["attributes"]
+        attributes["TEXCOORD_1"] = attributes.pop("TEXCOORD_0")
+        surface(scene)["baseColorTexture"]["texCoord"] = 1
+
+    assert colours(glb(tmp_path / "c.glb", body(), second)).tolist() == [[0, 0, 255]]
+
+
+@pytest.mark.parametrize(("mode", "expected"), [("BLEND", 127), ("MASK", 127), ("OPAQUE", 0)])
+def test_what_is_transparent_is_grey(tmp_path: Path, mode: str, expected: int) -> None:
+    """It was baked as black."""
+    mesh = body()
+    clear = Image.new("RGBA", (8, 8), (0, 0, 0, 0))
+    mesh.visual.material.baseColorTexture = clear
+    path = glb(tmp_path / "a.glb", mesh, lambda s: s["materials"][0].update(alphaMode=mode))
+    assert colours(path).tolist() == [[expected] * 3]
+
+
+def draco(scene: Scene) -> None:
+    scene["extensionsRequired"] = scene["extensionsUsed"] = ["KHR_draco_mesh_compression"]
+
+
+def rotated(scene: Scene) -> None:
+    turn = {"KHR_texture_transform": {"rotation": 0.5}}
+    surface(scene)["baseColorTexture"]["extensions"] = turn
+
+
+REFUSED = [
+    (draco, "uses KHR_draco_mesh_compression, which is not read here; export it again without"),
+    (lambda s: s.update(extensionsUsed=["KHR_mesh_quantization"]), "KHR_mesh_quantization"),
+    (lambda s: s.update(extensionsUsed=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
+    (lambda s: s.update(extensionsUsed=["KHR_materials_pbrSpecularGlossiness"]), "Glossiness, wh"),
+    (rotated, "turns a texture by KHR_texture_transform"),
+    (lambda s: surface(s)["baseColorTexture"].update(texCoord=3), "lacks .* TEXCOORD_3"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), REFUSED)
+def test_what_is_not_read_is_refused_by_name(
+    tmp_path: Path, change: Callable[[Scene], object], words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(BadObject, match=words):
+        read_mesh_file(glb(tmp_path / "a.glb", body(), change))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_extension_without_a_say_in_colours_passes(tmp_path: Path) -> None:
+    names = ["KHR_materials_ior", "KHR_lights_punctual", "KHR_materials_unlit"]
+    path = glb(tmp_path / "a.glb", body(), lambda s: s.update(extensionsUsed=names))
+    assert colours(path).tolist() == [[0, 0, 255]]
+
+
+def obj(folder: Path, material: str, name: str = "a") -> Path:
+    """A ball as OBJ with texture coordinates in the blue quarter, and its .mtl."""
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
+    lines = [f"mtllib {name}.mtl", "vt 0.25 0.25", "usemtl one"]
+    lines += ["v " + " ".join(map(str, vertex)) for vertex in mesh.vertices]
+    lines += ["f " + " ".join(f"{i + 1}/1" for i in face) for face in mesh.faces]
+    (folder / f"{name}.obj").write_text("\n".join(lines) + "\n")
+    (folder / f"{name}.mtl").write_text(f"newmtl one\n{material}\n")
+    return folder / f"{name}.obj"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "map_Kd pictures/q.png",
+        "map_Kd pictures\\q.png",
+        "map_Kd C:\\Users\\me\\q.png",
+        "map_Kd -s 1 1 1 pictures/q.png",
+        "map_Kd -clamp on -o 0 0 -s 1 1 1 pictures\\q.png",
+        "Kd 0.8 0.8 0.8\nmap_Kd pictures/q.png",
+    ],
+)
+def test_a_picture_of_an_obj_is_found(tmp_path: Path, line: str) -> None:
+    (tmp_path / "pictures").mkdir()
+    picture = Image.fromarray(QUARTERS.repeat(8, 0).repeat(8, 1))
+    picture.save(tmp_path / "pictures" / "q.png")
+    if "C:" in line:
+        picture.save(tmp_path / "q.png")
+    assert colours(obj(tmp_path, line)).tolist() == [[0, 0, 255]]
+
+
+def test_kd_alone_colours_an_obj(tmp_path: Path) -> None:
+    assert colours(obj(tmp_path, "Kd 0.1 0.3 0.8")).tolist() == [[26, 76, 204]]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("map_Kd missing.png", "refers to 'missing.png', and there is no such file beside it"),
+        ("map_Kd -s 2 2 1 q.png", "a texture that is moved or scaled .-s 2 2 1."),
+        ("Ns 10", "has no texture, UV map or vertex colours"),
+    ],
+)
+def test_what_an_obj_lacks_is_named(tmp_path: Path, line: str, words: str) -> None:
+    with pytest.raises(BadObject, match=words):
+        read_mesh_file(obj(tmp_path, line))
+    if "missing" in line:
+        found = read_mesh_file(tmp_path / "a.obj", colour="#aa3322")
+        assert np.unique(found.rgb, axis=0).tolist() == [[0xAA, 0x33, 0x22]]
+
+
+def test_a_ply_without_its_picture_is_one_line(tmp_path: Path) -> None:
+    """The log of the library came before it, eight lines of traceback."""
+    lines = ["ply", "format ascii 1.0", "comment TextureFile label.png", "element vertex 4"]
+    lines += [f"property float {name}" for name in ("x", "y", "z", "s", "t")]
+    lines += ["element face 4", "property list uchar int vertex_indices", "end_header"]
+    lines += ["0 0 0 0 0", "0.1 0 0 1 0", "0 0.1 0 0 1", "0 0 0.1 1 1"]
+    lines += ["3 0 2 1", "3 0 1 3", "3 1 2 3", "3 0 3 2"]
+    (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
+    line = refused("objects", "import", tmp_path / "a.ply", "--category", "cup")
+    assert "refers to 'label.png'" in line
