@@ -256,7 +256,9 @@ def test_rows_that_are_no_episodes_are_one_line(file: Path, body: str, words: st
 def test_a_task_of_a_name_that_is_there_is_refused(file: Path) -> None:
     """Each episode of it would be run twice."""
     file.write_text(DOCUMENTED.replace("(PICK,)", "(PICK, PICK)"))
-    with pytest.raises(BadSuite, match="two tasks are called pick-bottle; rename one") as refusal:
+    with pytest.raises(
+        BadSuite, match="two tasks of pick-bottle, pick-bottle have one name; rename one"
+    ) as refusal:
         suites.open_file(file)
     assert "desk.py" in str(refusal.value)
 

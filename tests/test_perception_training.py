@@ -8,10 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vap_core.simulation.assets import objects, phrases
+from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.phrases import UNSEEN
 from vap_make.films import scenes
 from vap_make.objects import draw, fabrics, generic_instance, textures
-from vap_make.perception import detector, evaluation, instance_head, segmenter
+from vap_make.perception import detector, evaluation, instance_head, phrases, segmenter
 from vap_make.perception import train as perception
 
 
@@ -61,7 +62,7 @@ def test_unseen_phrases_are_unseen() -> None:
         phrases.NEGATIVES
     )
     assert not trained & (
-        {p for words in phrases.UNSEEN.values() for p in words} | set(phrases.UNSEEN_NEGATIVES)
+        {p for words in UNSEEN.values() for p in words} | set(phrases.UNSEEN_NEGATIVES)
     )
     assert all(
         phrases.training_phrases(category)[0] == category

@@ -6,13 +6,13 @@ Many episodes may share one Scene; each has its own MjData.
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
-from vap_core.base.types import Camera, Mask, Rgb, value
+from vap_core.base.types import Camera, Mask, value
 from vap_core.simulation import cameras as optics
 from vap_core.simulation.cameras import hand_geoms
 from vap_core.simulation.contacts import (
@@ -118,14 +118,16 @@ class Env:
         self._settle = round(SETTLE_S / timestep)
         self._qpos = _qpos_addresses(self._model, self.robot.joints)
         self._fingers = _qpos_addresses(self._model, self.robot.fingers)
-        self._ctrl = _actuator_ids(self._model, (*self.robot.joints, *self.robot.fingers))
+        moved = (*self.robot.joints, *self.robot.fingers)
+        self._ctrl = np.array([self._model.actuator(name).id for name in moved])
         self._roles = geom_roles(scene)
         self._gripper = hand_geoms(scene.model)
-        self._body_ids = {}
-        for name in (*scene.objects, *self.robot.links):
-            self._body_ids[name] = self._model.body(name).id
+        names = (*scene.objects, *self.robot.links)
+        self._body_ids = {name: self._model.body(name).id for name in names}
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, self.robot.base_world[3:])
         base = np.eye(4)
-        base[:3, :3] = _matrix(self.robot.base_world[3:])
+        base[:3, :3] = turn.reshape(3, 3)
         base[:3, 3] = self.robot.base_world[:3]
         self._base_from_world = np.linalg.inv(base)
         self._row: EpisodeRow | None = None
@@ -171,10 +173,20 @@ class Env:
         weightless and invisible; so is an absent target.
         Raises: UnknownName when the row places an object that the scene lacks, or one twice.
         """
-        self._check_placed(row)
+        names = [place.model for place in row.placements]
+        for name in names:
+            if name not in self.scene.objects:
+                raise one_of(f"Env.reset({row.key}): object", name, self.scene.objects)
+        if len(set(names)) < len(names):
+            raise UnknownName(
+                f"Env.reset({row.key}): an object is placed twice in {names}; name each model once."
+            )
         data = self._data
         mujoco.mj_resetData(self._model, data)
-        joints = self._first_joints(row)
+        joints = self.robot.home
+        if row.start.joints_rad:
+            ids = [self._model.joint(name).id for name in self.robot.joints]
+            joints = np.clip(joints + row.start.joints_rad, *self._model.jnt_range[ids].T)
         data.qpos[self._qpos] = joints
         data.qpos[self._fingers] = self.robot.fingers_open
         data.ctrl[self._ctrl] = self._targets(joints, 1.0)
@@ -197,19 +209,18 @@ class Env:
         gripper's opening 0..1, and the joint angles (rad).
         """
         with self._timed("render"):
-            hidden = self._hidden()
+            light = PLAIN_LIGHT
+            if self._row is not None:
+                light = Light(self._row.start.lamp, self._row.start.ambient)
             images = {}
             for name in self.camera_names:
-                screens = self._screens(name)
                 rgb = self.scene.renderer.rgb(
-                    self._data,
-                    name,
-                    self.image_hw,
-                    hidden=hidden,
-                    before=screens,
-                    light=self._light(),
+                    self._data, name, self.image_hw, light=light, **self._shown(name)
                 )
-                images[name] = self._disturb(name, rgb)
+                if self._row is not None and name in self._disturbances:
+                    errors = self._disturbances[name]
+                    rgb = apply_sensor(self.sensor, rgb, errors, self._row, name, self._step())
+                images[name] = rgb
         return Observation(images, self.state())
 
     def state(self) -> Float32[np.ndarray, " s"]:
@@ -245,46 +256,28 @@ class Env:
 
     def is_beyond_limits(self, action: Action) -> bool:
         """Whether an action is far beyond the robot's speed; `step` cuts it to that."""
-        return is_beyond(
-            action=action, robot=self.robot, control=self.control, seconds=1.0 / self.hz
-        )
+        return is_beyond(action, self.robot, self.control, 1.0 / self.hz)
 
     def commanded(self, command: Setpoint, action: Action) -> Setpoint:
         """The command after `action`, given `command` and the present state; changes nothing."""
         seconds = 1.0 / self.hz
         if self.control == "ee":
-            return follow(
-                arm=self._arm,
-                command=command,
-                measured_base=self.tcp_base(),
-                action=action,
-                seconds=seconds,
-            )
-        return follow_joints(
-            arm=self._arm,
-            command=command,
-            measured=self._data.qpos[self._qpos].copy(),
-            action=action,
-            seconds=seconds,
-        )
+            return follow(self._arm, command, self.tcp_base(), action, seconds)
+        measured = self._data.qpos[self._qpos].copy()
+        return follow_joints(self._arm, command, measured, action, seconds)
 
     def truth(self, masks: bool = False) -> Truth:
         """Ground truth after the last step, on demand with every camera's visible object masks."""
         with self._timed("truth"):
-            poses = self._poses(self._placed)
-            links = self._poses(self.robot.links)
             masks_by_camera: dict[str, Mapping[str, Mask]] = {}
             hand: dict[str, Mask] = {}
-            if masks:
-                hidden = self._hidden()
-                for name in self.camera_names:
-                    screens = self._screens(name)
-                    masks_by_camera[name], hand[name] = self.scene.renderer.masks_and_hand(
-                        self._data, name, self.image_hw, hidden=hidden, before=screens
-                    )
+            for name in self.camera_names if masks else ():
+                masks_by_camera[name], hand[name] = self.scene.renderer.masks_and_hand(
+                    self._data, name, self.image_hw, **self._shown(name)
+                )
             return Truth(
-                objects_world=poses,
-                links_world=links,
+                objects_world=self._poses(self._placed),
+                links_world=self._poses(self.robot.links),
                 touched=self._touch.touched,
                 pressed_s=self._touch.pressed_s,
                 contacts=self._touch.contacts,
@@ -295,10 +288,10 @@ class Env:
     def cameras(self) -> tuple[Camera, ...]:
         """The calibrated cameras where they are now; a wrist camera moves."""
         if self._cameras is None:
-            cameras = []
-            for name in self.camera_names:
-                cameras.append(optics.camera(self._model, self._data, name, self.image_hw))
-            self._cameras = tuple(cameras)
+            self._cameras = tuple(
+                optics.camera(self._model, self._data, name, self.image_hw)
+                for name in self.camera_names
+            )
         return self._cameras
 
     def tcp_base(self) -> Float64[np.ndarray, "4 4"]:
@@ -323,27 +316,9 @@ class Env:
         self._begin(snapshot.row)
         self._update_poses()
 
-    def _first_joints(self, row: EpisodeRow) -> Float64[np.ndarray, " n"]:
-        """The joint angles at the start of the row's episode, within their limits."""
-        if not row.start.joints_rad:
-            return self.robot.home
-        ids = [self._model.joint(name).id for name in self.robot.joints]
-        low, high = self._model.jnt_range[ids].T
-        return np.clip(self.robot.home + np.array(row.start.joints_rad), low, high)
-
     def _first_command(self, joints: Float64[np.ndarray, " n"]) -> Setpoint:
         """The setpoint that holds the arm at `joints`, with an open gripper."""
         return Setpoint(self._arm.forward(joints), joints, 1.0)
-
-    def _check_placed(self, row: EpisodeRow) -> None:
-        names = [place.model for place in row.placements]
-        for name in names:
-            if name not in self.scene.objects:
-                raise one_of(f"Env.reset({row.key}): object", name, self.scene.objects)
-        if len(set(names)) < len(names):
-            raise UnknownName(
-                f"Env.reset({row.key}): an object is placed twice in {names}; name each model once."
-            )
 
     def _begin(self, row: EpisodeRow) -> None:
         """Take `row` as the episode, and draw the errors of its cameras."""
@@ -352,11 +327,8 @@ class Env:
         self._parked = set(self.scene.objects) - set(self._placed)
         if row.start.absent:
             self._parked.add(row.target)
-        disturbances = {}
-        if self.sensor != PERFECT:
-            for name in self.camera_names:
-                disturbances[name] = draw_disturbance(self.sensor, row, name)
-        self._disturbances = disturbances
+        names = self.camera_names if self.sensor != PERFECT else ()
+        self._disturbances = {name: draw_disturbance(self.sensor, row, name) for name in names}
 
     def _place_objects(self, row: EpisodeRow) -> None:
         """Put the objects of `row` in their places, and park the others without weight."""
@@ -368,24 +340,17 @@ class Env:
             quat = (np.cos(half), 0.0, 0.0, np.sin(half))
             position = (place.x + dx, place.y + dy, DROP_M)
             data.joint(f"{place.model}/free").qpos[:] = (*position, *quat)
-        n_parked = 0
-        for name in self.scene.objects:
-            if name not in self._parked:
-                continue
+        for i, name in enumerate(name for name in self.scene.objects if name in self._parked):
             body = model.body(name)
-            position = parked(self.robot, n_parked)
-            data.joint(f"{name}/free").qpos[:] = (*position, 1.0, 0.0, 0.0, 0.0)
+            data.joint(f"{name}/free").qpos[:] = (*parked(self.robot, i), 1.0, 0.0, 0.0, 0.0)
             data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
-            n_parked += 1
 
     def _advance(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
         """Advance physics with `ctrl`, one row a step or one for all, and note the contacts."""
         model = self._model
         data = self._data
         names = self.scene.objects
-        running_s = {}
-        for name, seconds in self._touch.running_s.items():
-            running_s[names.index(name)] = seconds
+        running_s = {names.index(name): s for name, s in self._touch.running_s.items()}
         watch = ContactWatch(self._roles, self._gripper, running_s)
         timestep = float(model.opt.timestep)
         for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
@@ -402,18 +367,9 @@ class Env:
 
     def _contacts(self) -> dict[str, frozenset[str]]:
         """The present partners of every touching object, as in Truth."""
-        pairs = self._roles[self._data.contact.geom]
-        contacts = {}
-        for index, roles in contact_partners(pairs).items():
-            contacts[self.scene.objects[index]] = frozenset(map(self._role_name, roles))
-        return contacts
-
-    def _role_name(self, role: int) -> str:
-        if role == ARM:
-            return ROBOT
-        if role == STILL:
-            return REST
-        return self.scene.objects[role]
+        names = {ARM: ROBOT, STILL: REST, **dict(enumerate(self.scene.objects))}
+        partners = contact_partners(self._roles[self._data.contact.geom])
+        return {names[i]: frozenset(names[role] for role in roles) for i, roles in partners.items()}
 
     def _update_poses(self) -> None:
         """Bring poses up to date with the state, and displace the cameras.
@@ -428,25 +384,6 @@ class Env:
             facing = camera.xmat.reshape(3, 3)
             camera.xpos[:] += facing @ disturbance.shift_m
             camera.xmat[:] = (facing @ disturbance.turn).ravel()
-
-    def _disturb(self, camera: str, rgb: Rgb) -> Rgb:
-        """The picture with the errors of its camera."""
-        if self._row is None or camera not in self._disturbances:
-            return rgb
-        return apply_sensor(
-            sensor=self.sensor,
-            rgb=rgb,
-            disturbance=self._disturbances[camera],
-            row=self._row,
-            camera=camera,
-            step=self._step(),
-        )
-
-    def _light(self) -> Light:
-        """The light of the episode."""
-        if self._row is None:
-            return PLAIN_LIGHT
-        return Light(lamp=self._row.start.lamp, ambient=self._row.start.ambient)
 
     def _screens(self, camera: str) -> tuple[Screen, ...]:
         """The occluder in front of `camera` now; the episode decides the side of an arm."""
@@ -484,9 +421,9 @@ class Env:
         poses = np.concatenate([self._data.xpos[ids], self._data.xquat[ids]], axis=1)
         return dict(zip(bodies, poses, strict=True))
 
-    def _hidden(self) -> frozenset[str]:
-        """The objects that are not on the table."""
-        return frozenset(self._parked)
+    def _shown(self, camera: str) -> dict[str, Any]:
+        """What a picture lacks and has: objects that are not on the table, and the occluder."""
+        return {"hidden": frozenset(self._parked), "before": self._screens(camera)}
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -497,15 +434,5 @@ class Env:
             self.seconds[part] += time.perf_counter() - start
 
 
-def _matrix(quat: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "3 3"]:
-    flat = np.zeros(9)
-    mujoco.mju_quat2Mat(flat, quat)
-    return flat.reshape(3, 3)
-
-
 def _qpos_addresses(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:
     return np.array([model.joint(name).qposadr[0] for name in joints])
-
-
-def _actuator_ids(model: mujoco.MjModel, names: Sequence[str]) -> np.ndarray:
-    return np.array([model.actuator(name).id for name in names])

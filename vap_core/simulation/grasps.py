@@ -86,11 +86,7 @@ def grasps(robot: Robot, target: str, poses: Mapping[str, Pose]) -> list[Grasp]:
 def too_wide_for(name: str) -> list[str]:
     """The robots that find no grasp of the object standing upright, alone on the table."""
     upright = np.array([0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    robots = []
-    for robot in ROBOTS.values():
-        if not grasps(robot, name, {name: upright}):
-            robots.append(robot.name)
-    return robots
+    return [robot.name for robot in ROBOTS.values() if not grasps(robot, name, {name: upright})]
 
 
 def _grasp_cost(grasp: Grasp) -> tuple[float, float]:

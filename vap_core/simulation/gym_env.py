@@ -35,6 +35,7 @@ LONGEST_RAD = 1.5
 MOST_SCENES = 16
 """Compiled scenes that are kept, one per variant and set of objects."""
 OUTCOME_FIELDS = (
+    "steps",
     "success",
     "success_once",
     "held_steps",
@@ -92,9 +93,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """
         super().reset(seed=seed)
         options = options or {}
-        row = options.get("row")
-        if row is None:
-            row = self._listed_row(options)
+        row = options.get("row") or self._listed_row(options)
         if not isinstance(row, EpisodeRow) or suites.suite(row.suite).robot != self.suite.robot:
             raise BadSuite(
                 f"reset: {row!r:.80} is no EpisodeRow for {self.suite.robot}; "
@@ -149,14 +148,12 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return "".join(sorted(set(CHARSET).union(*(row.instruction for row in rows))))
 
     def _actions(self) -> gymnasium.Space[Any]:
+        rates = self._env.robot.speed_rad_s
         if self.suite.control == "ee":
             rates = np.array([LONGEST_M] * 3 + [LONGEST_RAD] * 3)
-        else:
-            rates = np.array(self._env.robot.speed_rad_s)
         most = (rates / self.suite.hz).astype(np.float32)
-        low = np.append(-most, np.float32(0))
-        high = np.append(most, np.float32(1))
-        return spaces.Box(low, high, dtype=np.float32)
+        ends = np.append(-most, np.float32(0)), np.append(most, np.float32(1))
+        return spaces.Box(*ends, dtype=np.float32)
 
     def _listed_row(self, options: dict[str, Any]) -> EpisodeRow:
         """The row of the asked episode, or of one drawn at random."""
@@ -192,27 +189,16 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def _observe(self) -> dict[str, Any]:
         observation = self._env.observe()
-        return {
-            "images": dict(observation.images),
-            "state": observation.state,
-            "instruction": self._env.row.instruction,
-        }
+        images, words = dict(observation.images), self._env.row.instruction
+        return {"images": images, "state": observation.state, "instruction": words}
 
     def _info(self) -> dict[str, Any]:
         assert self._judge is not None
         outcome = self._judge.outcome()
         row = self._judge.row
-        info = {
-            "episode": row.episode,
-            "variant": row.variant,
-            "split": row.split,
-            "steps": outcome.steps,
-        }
-        for name in OUTCOME_FIELDS:
-            info[name] = getattr(outcome, name)
-        if outcome.cmr is not None:  # the paper defines none for selection
-            info["cmr"] = outcome.cmr
-        return info
+        info = {name: getattr(row, name) for name in ("episode", "variant", "split")}
+        info |= {name: getattr(outcome, name) for name in OUTCOME_FIELDS}
+        return info if outcome.cmr is None else {**info, "cmr": outcome.cmr}  # none for selection
 
 
 def env_id(suite: str, task: str) -> str:

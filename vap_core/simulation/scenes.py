@@ -24,6 +24,7 @@ import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
 
 Meshes = Literal["plain", "menagerie"]
+Point = tuple[float, float, float]
 
 
 @value
@@ -160,8 +161,7 @@ def _add_room(spec: mujoco.MjSpec, arm: Robot, style: SceneStyle) -> None:
     _set_rendering(spec, style)
     _add_lamp(spec, style)
     _add_materials(spec, style)
-    _add_floor_and_walls(spec, arm.floor_z_m)
-    _add_table(spec, arm)
+    _add_solids(spec, arm)
 
 
 def _set_rendering(spec: mujoco.MjSpec, style: SceneStyle) -> None:
@@ -207,57 +207,30 @@ def _add_materials(spec: mujoco.MjSpec, style: SceneStyle) -> None:
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=0.0, shininess=0.0)
 
 
-def _add_floor_and_walls(spec: mujoco.MjSpec, floor_z_m: float) -> None:
-    world = spec.worldbody
-    world.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[4, 4, 1],
-        pos=[0, 0, floor_z_m],
-        material="floor",
-    )
-    world.add_geom(
-        name="wall_back",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[0.05, 4, 2],
-        pos=[-1.15, 0, floor_z_m + 2],
-        material="wall",
-        contype=0,
-        conaffinity=0,
-    )
-    world.add_geom(
-        name="wall_left",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[4, 0.05, 2],
-        pos=[0, 1.6, floor_z_m + 2],
-        material="wall",
-        contype=0,
-        conaffinity=0,
-    )
+def _add_solids(spec: mujoco.MjSpec, arm: Robot) -> None:
+    """Floor, walls, and the table top with its legs down to the floor."""
+    world, z = spec.worldbody, arm.floor_z_m
+    box = mujoco.mjtGeom.mjGEOM_BOX
 
+    def out_of_touch(name: str, size: Point, pos: Point, material: str) -> None:
+        world.add_geom(
+            name=name, type=box, size=size, pos=pos, material=material, contype=0, conaffinity=0
+        )
 
-def _add_table(spec: mujoco.MjSpec, arm: Robot) -> None:
-    """The table top, and its legs down to the floor."""
-    world = spec.worldbody
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    world.add_geom(name="floor", type=plane, size=[4, 4, 1], pos=[0, 0, z], material="floor")
+    out_of_touch("wall_back", (0.05, 4.0, 2.0), (-1.15, 0.0, z + 2), "wall")
+    out_of_touch("wall_left", (4.0, 0.05, 2.0), (0.0, 1.6, z + 2), "wall")
     x0, y0, x1, y1 = arm.table_m
     world.add_geom(
         name="table",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
+        type=box,
         size=[(x1 - x0) / 2, (y1 - y0) / 2, 0.02],
         pos=[(x0 + x1) / 2, (y0 + y1) / 2, -0.02],
         material="planks",
         condim=4,
         friction=[1.0, 0.01, 0.0001],
     )
-    half_height = -0.5 * (arm.floor_z_m + 0.04)
-    corners = product((x0 + 0.07, x1 - 0.07), (y0 + 0.07, y1 - 0.07))
-    for i, (x, y) in enumerate(corners):
-        world.add_geom(
-            name=f"leg{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.03, 0.03, half_height],
-            pos=[x, y, -0.04 - half_height],
-            material="legs",
-            contype=0,
-            conaffinity=0,
-        )
+    half = -0.5 * (z + 0.04)
+    for i, (x, y) in enumerate(product((x0 + 0.07, x1 - 0.07), (y0 + 0.07, y1 - 0.07))):
+        out_of_touch(f"leg{i}", (0.03, 0.03, half), (x, y, -0.04 - half), "legs")

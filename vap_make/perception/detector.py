@@ -20,10 +20,11 @@ from vap_core.perception.embedded.networks import CHANNELS
 from vap_core.perception.embedded.networks import STRIDE as STRIDES
 from vap_core.perception.embedded.proposer import SIDE, STRIDE, TAPS, resize_for_search
 from vap_core.perception.text_encoder import embed_text
-from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, training_phrases
+from vap_core.simulation.assets.phrases import AMBIGUOUS
 from vap_make.films.scenes import POSES, Shots, boxes_of
 from vap_make.perception.fitting import Run, fit, half_precision
 from vap_make.perception.graphs import DetectHead
+from vap_make.perception.phrases import NEGATIVES, training_phrases
 
 BATCH = 16
 N_NEGATIVES = 16

@@ -16,7 +16,7 @@ from vap_core.perception.embedded.networks import TorchNetwork
 from vap_core.perception.embedded.proposer import THRESHOLD, LiteDetector, decode, resize_for_search
 from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.simulation.assets import objects
-from vap_core.simulation.assets.phrases import AMBIGUOUS, NEGATIVES, UNSEEN, UNSEEN_NEGATIVES
+from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.study.perception import FLOOR, VISIBLE_PX, match
 from vap_core.study.stats import average_precision, rate
 from vap_core.vote import similarity, vote
@@ -29,6 +29,7 @@ from vap_make.perception.graphs import (
     MaskHead,
     MaskNetwork,
 )
+from vap_make.perception.phrases import NEGATIVES, UNSEEN_NEGATIVES
 from vap_make.perception.segmenter import jitter
 
 TRAINED_NEGATIVES = NEGATIVES[:10]

@@ -1,27 +1,15 @@
 """A robot's MJCF file, checked: it holds every part that its `Robot` names."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float64
 
 from vap_core.base.errors import BadRobot, MissingMeshes, first_line, one_of
-from vap_core.base.types import value
 from vap_core.simulation.robots import Robot
-
-
-@value
-class Kind:
-    """The parts of one kind that a robot `needs` of its file, those that `there` are, the mend."""
-
-    name: str
-    needs: tuple[str, ...]
-    there: tuple[str, ...]
-    mend: str
 
 
 def load(robot: Robot) -> mujoco.MjSpec:
@@ -36,14 +24,36 @@ def load(robot: Robot) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(robot.xml))
     except ValueError as error:
         raise BadRobot(f"{where} is no MJCF ({first_line(error)}); correct the file.") from error
-    for kind in _kinds(spec, robot):
-        absent = [name for name in kind.needs if name not in kind.there]
-        if absent:
-            there = ", ".join(kind.there) or "none"
-            raise BadRobot(
-                f"{where} lacks the {kind.name} {absent[0]!r} (it has {there}); {kind.mend}."
-            )
-    _check_order(spec, robot, where)
+    joints = [joint.name for joint in spec.joints]
+    needed = (
+        ("body", robot.links, spec.bodies, "correct Robot.links or the file"),
+        ("joint", robot.joints, spec.joints, "correct Robot.joints or the file"),
+        ("joint", robot.fingers, spec.joints, "correct Robot.fingers or the file"),
+        (
+            "actuator",
+            (*robot.joints, *robot.fingers),
+            spec.actuators,
+            "give every joint and finger a position actuator of its name",
+        ),
+        (
+            "site",
+            ("tcp",),
+            spec.sites,
+            "add it between the fingertips, z out of the gripper and y along its opening axis",
+        ),
+    )
+    for kind, names, parts, mend in needed:
+        there = [part.name for part in parts]
+        for name in names:
+            if name not in there:
+                held = ", ".join(there) or "none"
+                raise BadRobot(f"{where} lacks the {kind} {name!r} (it has {held}); {mend}.")
+    found = tuple(name for name in joints if name not in robot.fingers)
+    if found != robot.joints:
+        raise BadRobot(
+            f"{where} has the joints {', '.join(found)} besides the fingers, and Robot.joints has "
+            f"{', '.join(robot.joints)}; name all of them there, in the order of the file."
+        )
     return spec
 
 
@@ -68,56 +78,6 @@ def other_files(robot: Robot) -> dict[str, Path]:
         if file != xml:
             files[os.path.relpath(file, xml.parent)] = file
     return dict(sorted(files.items()))
-
-
-def _kinds(spec: mujoco.MjSpec, robot: Robot) -> Iterator[Kind]:
-    """What the file must hold, kind by kind."""
-    joints = _names(spec.joints)
-    yield Kind(
-        name="body",
-        needs=robot.links,
-        there=_names(spec.bodies),
-        mend="correct Robot.links or the file",
-    )
-    yield Kind(
-        name="joint",
-        needs=robot.joints,
-        there=joints,
-        mend="correct Robot.joints or the file",
-    )
-    yield Kind(
-        name="joint",
-        needs=robot.fingers,
-        there=joints,
-        mend="correct Robot.fingers or the file",
-    )
-    yield Kind(
-        name="actuator",
-        needs=(*robot.joints, *robot.fingers),
-        there=_names(spec.actuators),
-        mend="give every joint and finger a position actuator of its name",
-    )
-    yield Kind(
-        name="site",
-        needs=("tcp",),
-        there=_names(spec.sites),
-        mend="add it between the fingertips, z out of the gripper and y along its opening axis",
-    )
-
-
-def _check_order(spec: mujoco.MjSpec, robot: Robot, where: str) -> None:
-    """The joints besides the fingers are those of the robot, in its order. Raises: BadRobot."""
-    found = tuple(name for name in _names(spec.joints) if name not in robot.fingers)
-    if found != robot.joints:
-        raise BadRobot(
-            f"{where} has the joints {', '.join(found)} besides the fingers, and Robot.joints has "
-            f"{', '.join(robot.joints)}; name all of them there, in the order of the file."
-        )
-
-
-def _names(parts: Sequence[Any]) -> tuple[str, ...]:
-    """The names of parts of a spec, in its order."""
-    return tuple(part.name for part in parts)
 
 
 MODELS = {
@@ -154,16 +114,19 @@ def replace_visuals(spec: mujoco.MjSpec, robot: Robot) -> None:
         name = _short(body)
         meshes = [geom for geom in body.geoms if geom.meshname and geom.group == SHOWN]
         for i, geom in enumerate(meshes):
-            if geom.meshname not in copied:
-                _copy_mesh(spec, source, geom.meshname)
-                copied.add(geom.meshname)
+            copy = _copied_name(geom.meshname)
+            if copy not in copied:
+                mesh = source.mesh(geom.meshname)
+                file = str(Path(source.modelfiledir) / source.meshdir / mesh.file)
+                spec.add_mesh(name=copy, file=file, scale=mesh.scale, inertia=SHELL)
+                copied.add(copy)
             pose = np.linalg.inv(frames[name]) @ frame @ _matrix(geom.pos, geom.quat)
             quat = np.zeros(4)
             mujoco.mju_mat2Quat(quat, pose[:3, :3].ravel())
             spec.body(name).add_geom(
                 name=_copied_name(f"{name}/{i}"),
                 type=mujoco.mjtGeom.mjGEOM_MESH,
-                meshname=_copied_name(geom.meshname),
+                meshname=copy,
                 material=_copied_name(geom.material),
                 pos=pose[:3, 3],
                 quat=quat,
@@ -213,13 +176,6 @@ def _copy_materials(spec: mujoco.MjSpec, source: mujoco.MjSpec) -> None:
         for role, texture in enumerate(material.textures):
             if texture:
                 copy.textures[role] = _copied_name(texture)
-
-
-def _copy_mesh(spec: mujoco.MjSpec, source: mujoco.MjSpec, name: str) -> None:
-    """Copy a mesh of `source` under another name."""
-    mesh = source.mesh(name)
-    file = Path(source.modelfiledir) / source.meshdir / mesh.file
-    spec.add_mesh(name=_copied_name(mesh.name), file=str(file), scale=mesh.scale, inertia=SHELL)
 
 
 def _copied_name(name: str) -> str:

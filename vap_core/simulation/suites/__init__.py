@@ -99,12 +99,8 @@ def own_suites() -> tuple[Suite, ...]:
 
 def own_files(names: Iterable[str]) -> tuple[str, ...]:
     """The files of the user's own suites among some, each once. Raises: BadSuite."""
-    files = []
-    for name in names:
-        own_suite = _find_own(name)
-        if own_suite is not None:
-            files.append(str(own_suite.file))
-    return tuple(dict.fromkeys(files))
+    opened = filter(None, map(_find_own, names))
+    return tuple(dict.fromkeys(str(own_suite.file) for own_suite in opened))
 
 
 def has_list(name: str) -> bool:
@@ -199,11 +195,8 @@ def _of_split(episodes: tuple[EpisodeRow, ...], split: str) -> tuple[EpisodeRow,
 def _seeded(suite_name: str, task_name: str, seed: int) -> tuple[EpisodeRow, ...]:
     """The list of a task under a seed."""
     joints = len(robots.get(suite(suite_name).robot).joints)
-    episodes = []
-    for row in benchmark(suite_name):
-        if row.task == task_name:
-            episodes.append(starts.seeded(row, seed, joints))
-    return tuple(episodes)
+    of_task = (row for row in benchmark(suite_name) if row.task == task_name)
+    return tuple(starts.seeded(row, seed, joints) for row in of_task)
 
 
 def tasks_of(suite_names: Iterable[str], own_target: str = "") -> tuple[tuple[str, str], ...]:
@@ -212,12 +205,12 @@ def tasks_of(suite_names: Iterable[str], own_target: str = "") -> tuple[tuple[st
     Raises: UnknownName; BadObject.
     """
     category = objects.get_object(own_target).category if own_target else ""
-    found = []
-    for name in suite_names:
-        for task in suite(name).tasks:
-            if not own_target or task.category == category:
-                found.append((name, task.name))
-    return tuple(found)
+    return tuple(
+        (name, task.name)
+        for name in suite_names
+        for task in suite(name).tasks
+        if not own_target or task.category == category
+    )
 
 
 def listed(

@@ -65,12 +65,8 @@ def radius_m(model: str) -> float:
 
 def place(model: str, spot: Spot, yaw: float) -> Placement:
     """A placement rounded as in the lists, to 0.1 mm and 0.1 mrad."""
-    return Placement(
-        model=model,
-        x=round(float(spot[0]), 4),
-        y=round(float(spot[1]), 4),
-        yaw=round(float(yaw), 4),
-    )
+    x, y, turn = (round(float(number), 4) for number in (*spot, yaw))
+    return Placement(model, x, y, turn)
 
 
 def random_yaw(rng: np.random.Generator) -> float:
@@ -82,10 +78,8 @@ def place_at_random_yaws(
     rng: np.random.Generator, models: Sequence[str], spots: Sequence[Spot]
 ) -> list[Placement]:
     """Each model on its spot, at a random yaw."""
-    placements = []
-    for model, spot in zip(models, spots, strict=True):
-        placements.append(place(model, spot, random_yaw(rng)))
-    return placements
+    pairs = zip(models, spots, strict=True)
+    return [place(model, spot, random_yaw(rng)) for model, spot in pairs]
 
 
 def scattered(
@@ -151,10 +145,7 @@ def _draw_free_spot(
 
 def _is_free(spot: Spot, radius: float, taken: Sequence[tuple[Spot, float]], gap_m: float) -> bool:
     x, y = spot
-    for (a, b), other_radius in taken:
-        if not np.hypot(x - a, y - b) > radius + other_radius + gap_m:
-            return False
-    return True
+    return all(np.hypot(x - a, y - b) > radius + other + gap_m for (a, b), other in taken)
 
 
 PICKED = (
@@ -193,18 +184,10 @@ class Arrangement:
 
 
 def _pick_tasks(max_steps: int) -> tuple[Task, ...]:
-    tasks = []
-    for category in PICKED:
-        slug = category.replace(" ", "-")
-        tasks.append(
-            Task(
-                name=f"pick-{slug}",
-                category=category,
-                instruction=f"pick up my {category}",
-                max_steps=max_steps,
-            )
-        )
-    return tuple(tasks)
+    return tuple(
+        Task(f"pick-{kind.replace(' ', '-')}", kind, f"pick up my {kind}", max_steps)
+        for kind in PICKED
+    )
 
 
 WIDOWX = Suite(

@@ -28,11 +28,7 @@ def build_scene(
 
 def models_of(rows: Iterable[EpisodeRow]) -> list[str]:
     """The objects that rows place, in the order of their first places."""
-    models: dict[str, None] = {}
-    for row in rows:
-        for place in row.placements:
-            models[place.model] = None
-    return list(models)
+    return list(dict.fromkeys(place.model for row in rows for place in row.placements))
 
 
 def make_env(

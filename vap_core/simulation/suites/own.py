@@ -136,30 +136,6 @@ def _said(error: BaseException) -> str:
     return lists.said(error)
 
 
-def _check_tasks(suite: Suite) -> None:
-    """Raises: BadSuite: a task's words do not fit, or two tasks have one name."""
-    names = set()
-    for task in suite.tasks:
-        check_wording(task)
-        if task.name in names:
-            raise BadSuite(f"two tasks are called {task.name}; rename one")
-        names.add(task.name)
-
-
-def _made_rows(make_rows: Callable[[], object]) -> tuple[EpisodeRow, ...]:
-    """What `rows()` returns. Raises: BadSuite: it is no list of episodes."""
-    mend = "return episodes made by SUITE.row(task, episode, placements)"
-    made = make_rows()
-    if not isinstance(made, Iterable):
-        raise BadSuite(f"rows() returned {type(made).__name__}; {mend}")
-    rows = []
-    for row in made:
-        if not isinstance(row, EpisodeRow):
-            raise BadSuite(f"rows() returned {type(row).__name__} as an episode; {mend}")
-        rows.append(row)
-    return tuple(rows)
-
-
 def _check_home(robot: Robot, model: Any) -> None:
     """Raises: BadSuite: a joint begins outside its range."""
     for name, angle in zip(robot.joints, robot.home.tolist(), strict=True):
@@ -188,35 +164,42 @@ def _checked_rows(
         for camera in suite.cameras:
             if camera not in rigs:
                 raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
-        _check_tasks(suite)
-        rows = _made_rows(make_rows)
+        for task in suite.tasks:
+            check_wording(task)
+        names = [task.name for task in suite.tasks]
+        if len(set(names)) < len(names):
+            raise BadSuite(f"two tasks of {', '.join(names)} have one name; rename one")
+        mend = "return episodes made by SUITE.row(task, episode, placements)"
+        made = make_rows()
+        if not isinstance(made, Iterable):
+            raise BadSuite(f"rows() returned {type(made).__name__}; {mend}")
+        rows = []
+        for row in made:
+            if not isinstance(row, EpisodeRow):
+                raise BadSuite(f"rows() returned {type(row).__name__} as an episode; {mend}")
+            rows.append(row)
         lists.check(rows, suite)
-        keys = set()
-        for row in rows:
+        keys = [row.key for row in rows]
+        for i, row in enumerate(rows):
             suite.task(row.task)
-            models = [objects.get_object(place.model) for place in row.placements]
-            if models[0].category != row.category:
+            first, *_ = [objects.get_object(place.model) for place in row.placements]
+            if first.category != row.category:
                 raise BadSuite(
-                    f"row {row.key}: its first object, the target, is {models[0].name}, a "
-                    f"{models[0].category}, and the task's category is {row.category!r}; place the "
+                    f"row {row.key}: its first object, the target, is {first.name}, a "
+                    f"{first.category}, and the task's category is {row.category!r}; place the "
                     "target first, or correct the category"
                 )
-            if row.suite != suite.name or row.key in keys:
-                raise BadSuite(
-                    f"row {row.key} is there twice, or of another suite; make rows by "
-                    "SUITE.row(task, episode, placements)"
-                )
+            if row.suite != suite.name or keys.index(row.key) < i:
+                raise BadSuite(f"row {row.key} is there twice, or of another suite; {mend}")
             if row.seed != 0:
                 raise BadSuite(
                     f"row {row.key} has seed={row.seed}; leave it 0: seeds come from --seed"
                 )
-            keys.add(row.key)
-        for task in suite.tasks:
-            if not any(row.task == task.name for row in rows):
-                raise BadSuite(f"task {task.name} has no row")
+        for name in set(names) - {row.task for row in rows}:
+            raise BadSuite(f"task {name} has no row")
     except (Exception, SystemExit) as error:  # rows() is the user's: anything may come of it
         raise BadSuite(f"suites: {_place(path, path.resolve(), error)}: {_said(error)}") from error
-    return rows
+    return tuple(rows)
 
 
 def _digest(rows: Iterable[EpisodeRow]) -> str:

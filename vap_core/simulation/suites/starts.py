@@ -69,27 +69,14 @@ def _standing(row: EpisodeRow) -> frozenset[str]:
 
 def _on_top(listed: Start, change: Start) -> Start:
     """A list's start with a seed's change: angles and offsets are added, light is multiplied."""
-    joints = change.joints_rad
+    joints, offsets = change.joints_rad, change.offsets
     if listed.joints_rad:
-        joints = _sum(listed.joints_rad, change.joints_rad)
-    offsets = change.offsets
+        joints = tuple(np.add(listed.joints_rad, joints).tolist())
     if listed.offsets:
-        sums = []
-        for one, other in zip(listed.offsets, change.offsets, strict=True):
-            dx, dy, turn = _sum(one, other)
-            sums.append((dx, dy, turn))
-        offsets = tuple(sums)
-    return replace(
-        listed,
-        joints_rad=joints,
-        offsets=offsets,
-        lamp=listed.lamp * change.lamp,
-        ambient=listed.ambient * change.ambient,
-    )
-
-
-def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(np.add(one, other).tolist())
+        dx, dy, turn = np.add(listed.offsets, offsets).T.tolist()
+        offsets = tuple(zip(dx, dy, turn, strict=True))
+    lamp, ambient = listed.lamp * change.lamp, listed.ambient * change.ambient
+    return replace(listed, joints_rad=joints, offsets=offsets, lamp=lamp, ambient=ambient)
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:
@@ -132,11 +119,12 @@ def check_category(name: str, suite: Suite, task_name: str, known: Iterable[Suit
     wanted = suite.task(task_name).category
     if model.category == wanted:
         return
-    fitting = []
-    for other in known:
-        for task in other.tasks:
-            if task.category == model.category:
-                fitting.append(f"{other.name}/{task.name}")
+    fitting = [
+        f"{other.name}/{task.name}"
+        for other in known
+        for task in other.tasks
+        if task.category == model.category
+    ]
     remedy = f"import it with --category {wanted!r}, if it is one"
     if fitting:
         remedy = f"take a task with a {model.category}: {', '.join(fitting)}"
@@ -148,11 +136,7 @@ def check_category(name: str, suite: Suite, task_name: str, known: Iterable[Suit
 
 def _target_spots(rows: Sequence[EpisodeRow]) -> tuple[Spot, ...]:
     """The places of the rows' targets, each once."""
-    spots: dict[Spot, None] = {}
-    for row in rows:
-        target = row.placements[0]
-        spots[target.x, target.y] = None
-    return tuple(spots)
+    return tuple(dict.fromkeys((row.placements[0].x, row.placements[0].y) for row in rows))
 
 
 def _disc_radii_m(rows: Sequence[EpisodeRow], name: str) -> dict[str, float]:
@@ -196,8 +180,8 @@ def _has_room(
     name: str, spot: Spot, others: Sequence[Placement], radii_m: Mapping[str, float]
 ) -> bool:
     """Whether the object's disc keeps `APART_M` to every other object's."""
-    for other in others:
-        apart_m = float(np.hypot(spot[0] - other.x, spot[1] - other.y))
-        if apart_m < radii_m[name] + radii_m[other.model] + APART_M:
-            return False
-    return True
+    return all(
+        np.hypot(spot[0] - other.x, spot[1] - other.y)
+        >= radii_m[name] + radii_m[other.model] + APART_M
+        for other in others
+    )

@@ -91,11 +91,9 @@ class Suite:
         self, episodes: int, placements: Callable[[Task, int], tuple[Placement, ...]]
     ) -> tuple[EpisodeRow, ...]:
         """So many episodes of every task; `placements` are those of a task's i-th episode."""
-        rows = []
-        for task in self.tasks:
-            for i in range(episodes):
-                rows.append(self.row(task, i, placements(task, i)))
-        return tuple(rows)
+        return tuple(
+            self.row(task, i, placements(task, i)) for task in self.tasks for i in range(episodes)
+        )
 
 
 @value
