@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import trimesh
@@ -9,8 +11,9 @@ import trimesh
 from tests.command import vap
 from tests.scanned import put
 from vap_core import cli
-from vap_core.base.errors import command
+from vap_core.base.errors import command, one_of
 
+ROOT = Path(__file__).resolve().parents[1]
 ODD = "a b'c $x"
 """A folder's name that a shell takes apart, unless it is quoted."""
 
@@ -55,3 +58,24 @@ def test_no_command_is_printed_with_a_value_that_is_not_quoted() -> None:
     for path in sorted(Path(cli.__file__).parent.rglob("*.py")):
         found = re.findall(r"""f["'].*python -m vap_core [^"]*\{.*""", path.read_text())
         assert not found, path.name
+
+
+def test_another_python_is_told_the_set_up_in_one_line(tmp_path: Path) -> None:
+    """It was a traceback about lazy_loader."""
+    isolated = [sys.executable, "-S", "-m", "vap_core", "doctor"]
+    done = subprocess.run(isolated, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert "run `make setup`, then .venv/bin/python -m vap_core" in line
+
+
+def test_an_unknown_name_shows_the_nearest_first() -> None:
+    """It listed 140 names in the order of the alphabet."""
+    objects = [f"object-{i}" for i in range(140)]
+    error = str(one_of("eval: object", "camra-personal", [*objects, "camera-personal"]))
+    assert error.startswith("eval: object 'camra-personal' is unknown; known: camera-personal, ")
+    assert error.endswith(" and 117 more.")
+    assert str(one_of("m:", "vpa", ["generic", "vap", "hard"])).endswith(
+        "known: vap, generic, hard."
+    )
+    assert str(one_of("m:", "cam", ["a-cam-b", "zzz"])).endswith("known: a-cam-b, zzz.")

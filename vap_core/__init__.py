@@ -6,9 +6,17 @@ or rerun. Start reading at attend.py.
 """
 
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
-import lazy_loader
+try:
+    import lazy_loader
+except ModuleNotFoundError as error:
+    _ABSENT = f"{error.name} is not installed for {sys.executable} (Python {sys.version.split()[0]}"
+    _ABSENT += "); run `make setup`, then .venv/bin/python -m vap_core"
+    if sys.argv[:1] == ["-m"]:
+        sys.exit(f"error: {_ABSENT}")
+    raise ModuleNotFoundError(f"vap_core: {_ABSENT}", name=error.name) from error
 
 # Before any of them is imported, in this process and in those that it starts: nothing is sent out.
 for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):

@@ -8,6 +8,7 @@ import threading
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -162,13 +163,21 @@ class WorkerDied(VapError):
     """A worker process that was killed; what it had not finished runs again."""
 
 
+SHOWN = 24
+"""Names that an error lists; of more, those nearest to what was written."""
+
+
 def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
-    """The error for a name that a registry lacks, with the names that it holds.
+    """The error for a name that a registry lacks, with the names that it holds, the nearest first.
 
     `one_of("make_env: task", "x", TASKS)` reads "make_env: task 'x' is unknown; known: ...".
     """
-    names = ", ".join(sorted(map(str, known)))
-    return UnknownName(f"{what} {name!r} is unknown; known: {names}.")
+    names = sorted(set(map(str, known)))
+    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    near += [each for each in names if name and name in each and each not in near][:3]
+    ordered = [*near, *(each for each in names if each not in near)]
+    more = f" and {len(ordered) - SHOWN} more" if len(ordered) > SHOWN else ""
+    return UnknownName(f"{what} {name!r} is unknown; known: {', '.join(ordered[:SHOWN])}{more}.")
 
 
 EXTRAS = {

@@ -92,7 +92,11 @@ def describe_rejection(grounding: Grounding) -> str:
     if grounding.candidates.verified is not None:
         measure = "likeness"
         counted = f", {grounding.candidates.verified[grounding.rejected]} points verified"
-    return f"not in view, {measure} {likeness:.2f} below {grounding.threshold:.2f}{counted}"
+    digits = 2  # as many as tell the two apart
+    while digits < 6 and f"{likeness:.{digits}f}" == f"{grounding.threshold:.{digits}f}":
+        digits += 1
+    below = f"{likeness:.{digits}f} below {grounding.threshold:.{digits}f}"
+    return f"not in view, {measure} {below}{counted}"
 
 
 def describe_lead(ballot: Ballot) -> str:

@@ -11,6 +11,7 @@ import html
 import inspect
 import json
 import os
+import re
 import shutil
 import stat
 import struct
@@ -209,6 +210,8 @@ def file_fault(path: Path) -> str:
     `Path.is_file` raises for a folder without rights, and for a name that is too long.
     """
     try:
+        if re.match(r"https?:/", str(path)):
+            return "is an address, and nothing is fetched here; download it and name the file"
         if not path.is_file():
             return "is not a file"
         with path.open("rb"):

@@ -50,7 +50,7 @@ class Finding:
         mark = "ok     "
         if not self.works:
             mark = "MISSING" if self.needed else "absent "
-        return f"{mark}  {self.what:<20} {self.detail}"
+        return f"{mark}  {self.what:<22} {self.detail}"
 
 
 @app.command()
@@ -74,7 +74,7 @@ def examine() -> list[Finding]:
     findings = []
     for check in (_python, _gl, _weights, _lists, _rerun):
         findings.append(_run_check(check, needed=True))
-    for check in (_text_encoder, _torch, _gpu, _lerobot, _menagerie):
+    for check in (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie):
         findings.append(_run_check(check, needed=False))
     findings.append(_viewer())
     findings += _foundation()
@@ -208,6 +208,16 @@ def _viewer() -> Finding:
     binary = shutil.which("rerun", path=f"{beside_python}{os.pathsep}{paths}")
     detail = binary or "no rerun command beside this Python; run make setup"
     return Finding("rerun viewer", binary is not None, detail, needed=False)
+
+
+def _pictures() -> tuple[str, str]:
+    """Pictures of recordings (--png) are drawn by Rerun's viewer, which needs Vulkan."""
+    from vap_core.recording.show import DRIVER, has_display, has_driver
+
+    if not has_driver():
+        raise VapError(f"no Vulkan driver for --png; run: apt-get install -y {DRIVER}")
+    window = "a display is there" if has_display() else "no display: use --png instead of a window"
+    return "pictures of recordings", f"a Vulkan driver is there; {window}"
 
 
 def _foundation() -> list[Finding]:

@@ -116,6 +116,15 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
     viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
 
 
+def has_driver() -> bool:
+    """Whether a Vulkan driver is installed that can draw pictures of recordings (Linux)."""
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if named or sys.platform != "linux":
+        return True
+    roots = ("/usr/share", "/usr/local/share", "/etc", str(Path.home() / ".local/share"))
+    return any(list(Path(root, "vulkan", "icd.d").glob("*.json")) for root in roots)
+
+
 def has_display() -> bool:
     """Whether a window can be opened here; outside Linux it always can."""
     if sys.platform != "linux":

@@ -92,6 +92,8 @@ def build(folder: Path, device: str | None) -> tuple["PreTrainedPolicy", Any, An
     device = device_name(device)
     try:
         policy, preprocessor, postprocessor = _build(folder, device)
+    except BadPolicy:  # it says its own remedy
+        raise
     except Exception as error:
         remedy = "check its files, or save it again with lerobot 0.6"
         models = base_models(folder) if "huggingface.co" in str(error) else []

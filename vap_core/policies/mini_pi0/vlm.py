@@ -137,6 +137,8 @@ def load_vlm(folder: Path) -> MiniVlm:
         config = PreTrainedConfig.from_pretrained(folder)
         vlm = MiniVlm(cast(MiniPI0Config, config))
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
+    except BadPolicy:  # it says its own remedy
+        raise
     except Exception as error:
         raise BadPolicy(
             f"load_vlm: {folder} is damaged ({type(error).__name__}: {first_line(error):.150}); "
@@ -162,6 +164,8 @@ def load_from_policy(folder: Path) -> MiniVlm:
             if name.startswith(IN_POLICY)
         }
         vlm.towers.paligemma.load_state_dict(weights)
+    except BadPolicy:  # it says its own remedy
+        raise
     except Exception as error:
         raise BadPolicy(
             f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: "
