@@ -66,10 +66,10 @@ lab: setup
 	.venv/bin/jupyter lab --ip 127.0.0.1 $(QUIET_LAB) $(WHOLE) $(AS_ROOT)
 
 html: setup
-	@$(RUN) -m vap_core.analysis.notebook_pages
+	@$(RUN) -m vap_make.pages
 
 links: setup
-	@$(RUN) -m vap_core.analysis.notebook_links
+	@$(RUN) -m vap_make.pages links
 
 lock: setup
 	.venv/bin/uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt

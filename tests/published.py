@@ -4,7 +4,7 @@ import pandas as pd
 
 from tests.pages import ROOT
 from vap_core.study.results import read_runs
-from vap_core.study.stats import Rate, rate, rate_over_layouts
+from vap_core.study.stats import Estimate, rate, rate_over_layouts
 
 RESULTS = ROOT / "data" / "results"
 
@@ -32,6 +32,6 @@ def over_layouts(told: pd.DataFrame, way: str) -> str:
     return in_percent(rate_over_layouts(rows)) if len(rows) else ""
 
 
-def in_percent(found: Rate) -> str:
+def in_percent(found: Estimate) -> str:
     """A rate as the pages print it, without the sign: only 0 is 0, and only 1 is 100."""
     return str(found).replace(" %", "")

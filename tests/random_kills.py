@@ -32,9 +32,9 @@ def write_report(run: Path, out: Path) -> None:
 
 def ground(clip: Path, bank: Path, out: Path) -> None:
     from tests.toys import MeanColour, SameColour, detector, segmenter
-    from vap_core.analysis.ground_clip import ground_clip
     from vap_core.perception import stacks
     from vap_core.perception.protocols import Stack
+    from vap_core.study.grounding import ground_clip
 
     stacks.STACKS["toy"] = lambda: Stack("toy", detector, MeanColour(), segmenter, SameColour())
     ground_clip(clip, "bring my cup", bank, "toy", out)
@@ -116,7 +116,7 @@ class Server:
 
 NEEDED = (
     "matplotlib.backends.backend_agg",
-    "vap_core.analysis.ground_clip",
+    "vap_core.study.grounding",
     "vap_core.study.report",
     "vap_core.recording",
 )

@@ -1,6 +1,5 @@
 """How failures divide into cases, and at which stages episodes are lost: tables and pictures."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,20 +7,19 @@ import pandas as pd
 import pytest
 
 from vap_core.base import pictures
-from vap_core.base.files import align
 from vap_core.recording import recording_file_name
 from vap_core.rollout.types import CASES
-from vap_core.study.charts import funnel_figure
+from vap_core.study.charts import funnel
 from vap_core.study.diagnosis import STAGES
 from vap_core.study.failures import (
     breakdown,
-    breakdown_rows,
+    breakdown_table,
     funnel_table,
     sub_cases_table,
     sub_cases_text,
 )
 from vap_core.study.report import report_page
-from vap_core.study.stats import rate
+from vap_core.study.table import printed
 
 STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
 
@@ -85,7 +83,7 @@ def test_an_error_that_an_older_version_diagnosed_counts_as_no_failure() -> None
 
 
 def test_as_text_every_share_has_its_interval() -> None:
-    told = align(breakdown_rows(breakdown(TABLE)))
+    told = printed(breakdown_table(breakdown(TABLE)))
     assert "44 % [19, 73]" in told
     assert "75 % [30, 95]" in told
     assert "case 1 %" not in told, "no row has any"
@@ -109,49 +107,41 @@ def test_what_several_policies_did_is_not_added_up() -> None:
     counts = breakdown(two)
     assert counts.method.tolist() == ["vap, a", "generic, a", "vap, b", "generic, b"]
     assert counts.n.tolist() == [9, 2, 9, 2]
-    assert [line.method for line in funnel_table(two)] == counts.method.tolist()
+    assert list(dict.fromkeys(funnel_table(two).method)) == counts.method.tolist()
     alone = two[(two.policy == "a") | (two.method == "vap")]
     assert breakdown(alone).method.tolist() == ["vap, a", "generic", "vap, b"]
-    lines = funnel_figure(funnel_table(two), {"vap": "red"}).legends[0].get_texts()
-    assert [line.get_text() for line in lines][:2] == ["vap, a", "vap, b"]
+    lines = funnel(funnel_table(two)).legends[0].get_texts()
+    assert [line.get_text() for line in lines] == counts.method.tolist()
     assert breakdown(TABLE.assign(policy="a")).equals(breakdown(TABLE))
 
 
-def test_the_road_narrows_and_ends_with_the_successes() -> None:
-    vap, generic = funnel_table(TABLE)
-    assert (vap.n, vap.left, vap.succeeded) == (9, (8, 5, 5, 5, 4, 4, 4), 4)
-    assert (generic.n, generic.left) == (2, (None, None, None, None, 2, 0, 0))
-    assert all(a >= b for a, b in zip(vap.left, vap.left[1:], strict=False))  # type: ignore[operator]
+def left(method: str, table: pd.DataFrame = TABLE) -> dict[str, int]:
+    found = funnel_table(table)
+    of_method = found[found.method == method]
+    return dict(zip(of_method.stage, of_method.left, strict=True))
 
 
-def test_a_method_that_has_errors_alone_has_no_line() -> None:
+def test_the_funnel_narrows_and_ends_with_the_successes() -> None:
+    assert list(left("vap").values()) == [8, 5, 5, 5, 4, 4, 4, 4]
+    assert left("generic") == {"touched": 2, "lifted": 0, "success": 0, "SR": 0}
+    assert set(funnel_table(TABLE).query("method == 'vap'").n) == {9}
+
+
+def test_a_method_that_has_errors_alone_has_its_rate_alone() -> None:
     """`report` fell on it."""
     of_vap = TABLE[TABLE.method == "vap"]
     errors = pd.DataFrame([{**row("soft", outcome="error"), **dict.fromkeys(STAGE_COLUMNS)}] * 2)
-    lines = funnel_table(pd.concat([of_vap, errors], ignore_index=True))
-    assert lines[1].left == (None,) * len(STAGES)
-    figure = funnel_figure(lines, {"vap": "red", "soft": "grey"})
-    assert [text.get_text() for text in figure.legends[0].get_texts()][:-1] == ["vap"]
-    assert figure.axes[0].get_title() == "vlabench (n 9)"
-    both = funnel_figure(funnel_table(TABLE), {"vap": "red", "generic": "grey"})
-    assert both.axes[0].get_title() == "vlabench (n 2 to 9)"
-    assert funnel_figure(lines, {"soft": "grey"}).axes[0].get_title() == "vlabench"
-
-
-def test_a_success_rate_is_rounded_as_the_tables_round_it() -> None:
-    """92 of 160 were 58 in the funnel and 57 in the tables."""
-    vap, _ = funnel_table(TABLE)
-    tied = replace(vap, n=160, left=(92,) * len(STAGES), succeeded=92)
-    (label,) = funnel_figure([tied], {"vap": "red"}).axes[0].texts
-    assert str(rate(92, 160)).split(" %")[0] == label.get_text() == "57"
+    both = pd.concat([of_vap, errors], ignore_index=True)
+    assert left("soft", both) == {"SR": 0}
+    assert funnel(funnel_table(both)).axes[0].get_title() == "vlabench"
+    assert funnel(funnel_table(of_vap)).axes[0].get_title() == "vlabench (n 9)"
 
 
 def test_a_method_that_reads_the_simulator_is_dashed() -> None:
     table = pd.concat([TABLE.assign(bound=False), TABLE.assign(bound=True, method="wrong-mask")])
-    figure = funnel_figure(funnel_table(table), {"vap": "red", "wrong-mask": "black"})
-    drawn = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
-    styles = {line.get_color(): line.get_linestyle() for line in drawn}
-    assert (styles["red"], styles["black"]) == ("-", "--")
+    lines = funnel(funnel_table(table)).axes[0].lines
+    styles = {line.get_label(): line.get_linestyle() for line in lines}
+    assert (styles["vap"], styles["wrong-mask"]) == ("-", "--")
 
 
 def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 
 from tests.command import refused
 from tests.toys import MeanColour, SameColour, segmenter
-from vap_core.analysis import ground
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.cli import machine
@@ -18,6 +17,7 @@ from vap_core.perception import protocols, stacks
 from vap_core.perception.foundation import weights as hub
 from vap_core.perception.protocols import Stack, Thresholds
 from vap_core.simulation.assets import objects
+from vap_core.study import grounding
 from vap_make.calibration import report, run, scenes
 
 
@@ -192,7 +192,7 @@ def test_a_stack_with_an_embedded_part_is_calibrated_on_photos(name, tmp_path, m
     run.refuse_keep(name, [tmp_path])
     judged = replace(TOY, detector=Judge())
     monkeypatch.setattr(stacks, "load_own", lambda name: judged)
-    assert f"calibration --stack {name} --photos SET --keep" in ground.missing_threshold(name)
+    assert f"calibration --stack {name} --photos SET --keep" in grounding.missing_threshold(name)
     monkeypatch.setattr(run, "load_stack", lambda name: judged)
     monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
     with pytest.raises(BadOutput, match="more photos in the set"):
@@ -245,11 +245,11 @@ def test_a_threshold_for_own_photos_is_kept_and_runs_do_not_depend_on_it(tmp_pat
 def test_an_own_stack_without_thresholds_uses_what_was_kept(tmp_path, monkeypatch):
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
     monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
-    assert "calibration --stack toy --keep" in ground.missing_threshold("toy")
+    assert "calibration --stack toy --keep" in grounding.missing_threshold("toy")
     run.refuse_keep("toy")
     run.keep_choice("toy", report.Choice(0.9, None))
     assert stacks.load_own("toy").thresholds == Thresholds(0.9, 0.9)
-    assert ground.missing_threshold("toy") == ""
+    assert grounding.missing_threshold("toy") == ""
     assert stacks.load_stack("toy").thresholds is None
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, detector=Judge()))
     with pytest.raises(BadOutput, match="calibration --stack toy --photos SET --keep"):
@@ -284,9 +284,9 @@ def test_photos_are_measured_without_scenes(tmp_path, monkeypatch):
 
 def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: TOY)
-    assert "calibration --stack toy --keep" in ground.missing_threshold("toy")
+    assert "calibration --stack toy --keep" in grounding.missing_threshold("toy")
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, thresholds=Thresholds(0.5, 0.5)))
-    assert ground.missing_threshold("toy") == ""
+    assert grounding.missing_threshold("toy") == ""
 
 
 def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeypatch):

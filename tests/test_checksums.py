@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadOutput, MissingWeights
+from vap_core.base.files import DATA
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.embedded.networks import weights_sha256
 from vap_core.perception.foundation.weights import LOCK, MODELS, TENSORS, VARIABLE
@@ -20,7 +21,6 @@ from vap_core.perception.stacks import STACKS, checksums, describe_parts
 from vap_core.study import objects as own_objects
 from vap_core.study import photos as photos
 from vap_core.study.objects import Source
-from vap_core.study.photos import PhotoSet
 from vap_core.study.store import digest, open_run
 from vap_core.study.survey import Survey
 from vap_core.study.trials import Study
@@ -38,16 +38,20 @@ def of_study(stack: str) -> dict[str, Any]:
 
 
 def of_survey(stack: str) -> dict[str, Any]:
-    return Survey(stack, ("simpler-bridge",)).configuration()
+    return Survey(stack, ("simpler-bridge",)).settings()
 
 
 def of_photos(stack: str) -> dict[str, Any]:
-    return photos._configuration(PhotoSet((), (), {}, "the photos'"), stack, kept=True)
+    return photos.PhotoMeasurement(DATA / "photo-set", stack).settings()
+
+
+@pytest.fixture(autouse=True)
+def source(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_objects, "read_source", lambda _: Source({}, {}, "the objects'"))
 
 
 def of_objects(stack: str) -> dict[str, Any]:
-    source = Source({}, {}, "the objects'")
-    return own_objects._configuration(source, own_objects.ObjectSurvey(stack=stack))
+    return own_objects.ObjectMeasurement(Path(), stack=stack).settings()
 
 
 def of_calibration(stack: str) -> dict[str, Any]:

@@ -8,12 +8,12 @@ import pandas as pd
 import pytest
 
 from vap_core.base.errors import BadCluster, BadSuite, WorkerDied
-from vap_core.study import cluster, engine, steps
+from vap_core.study import engine, steps, workers
 from vap_core.study.engine import Job, Rows, run_job
 from vap_core.study.logs import read_states as read_traces
-from vap_core.study.processes import results
 from vap_core.study.store import open_run
 from vap_core.study.trials import Study
+from vap_core.study.workers import results
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=6)
 
@@ -36,7 +36,7 @@ def test_another_machine_opens_the_files_of_own_suites_first(tmp_path: Path) -> 
     object.__setattr__(study, "suite_files", (str(away),))
     job = Job(study, "generic", (), (), 1, tmp_path, "none")
     with pytest.raises(BadSuite, match=r"desk\.py"):
-        cluster._run_remotely(run_job, job, {}, {"digest": ""})
+        workers._run_remotely(run_job, job, {}, {"digest": ""})
 
 
 @pytest.mark.sweep
@@ -49,7 +49,7 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
         tmp_path / "ray",
         record="all",
         progress=False,
-        executor=cluster.ray_executor(address),
+        executor=workers.ray_executor(address),
     )
     here = engine.run(STUDY, tmp_path / "local", record="all", progress=False, executor=results)
     columns = [
@@ -71,7 +71,7 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
     found = [steps.query(tmp_path / name, "steps > 0") for name in ("ray", "local")]
     pd.testing.assert_frame_equal(*found)
     again = engine.run(
-        STUDY, tmp_path / "ray", progress=False, executor=cluster.ray_executor("127.0.0.1:1")
+        STUDY, tmp_path / "ray", progress=False, executor=workers.ray_executor("127.0.0.1:1")
     )
     pd.testing.assert_frame_equal(again, there)  # nothing is missing, nobody is asked
 
@@ -83,14 +83,14 @@ def test_a_cluster_gives_what_local_processes_give(address: str, tmp_path: Path)
 
     jobs = list(engine.missing_jobs(STUDY, open_run(tmp_path / "dies", STUDY.configuration())))[:1]
     with pytest.raises(WorkerDied, match="a worker of the cluster died"):
-        list(cluster.ray_executor(address)(dies, jobs, 1, ""))
+        list(workers.ray_executor(address)(dies, jobs, 1, ""))
     strange = list(
         engine.missing_jobs(
             STUDY, open_run(tmp_path / "strange", {**STUDY.configuration(), "version": "9.9"})
         )
     )[:1]
     with pytest.raises(BadCluster, match=r"is not like this machine \(version 9.9 there"):
-        list(cluster.ray_executor(address)(dies, strange, 1, ""))
+        list(workers.ray_executor(address)(dies, strange, 1, ""))
 
 
 @pytest.mark.parametrize("name", ["/tmp/x", "../x", "parts/../../x", ""])
@@ -98,7 +98,7 @@ def test_a_worker_writes_into_the_run_alone(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     with pytest.raises(BadCluster, match="outside the run's folder; join clusters that you trust"):
-        cluster._write_files(folder, {"parts/a.parquet": b"a", name: b"x"})
+        workers._write_files(folder, {"parts/a.parquet": b"a", name: b"x"})
     assert not list(folder.iterdir())
 
 
@@ -108,5 +108,5 @@ def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
         match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head",
     ):
         engine.run(
-            STUDY, tmp_path / "run", progress=False, executor=cluster.ray_executor("nowhere")
+            STUDY, tmp_path / "run", progress=False, executor=workers.ray_executor("nowhere")
         )

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from vap_core.analysis import controls
+from vap_core import notebook
 from vap_core.base.errors import UnknownName
 from vap_core.base.media import load_photo
 
@@ -16,7 +16,7 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def test_an_episode_has_the_tasks_and_cameras_of_its_suite() -> None:
-    choice = controls.EpisodeChoice("vlabench", "select-cup", 3, "wrist")
+    choice = notebook.EpisodeChoice("vlabench", "select-cup", 3, "wrist")
     assert choice.chosen == ("vlabench", "select-cup", 3, "wrist")
     choice.suite.value = "simpler-bridge"
     suite, task, number, camera = choice.chosen
@@ -28,7 +28,7 @@ def test_an_episode_has_the_tasks_and_cameras_of_its_suite() -> None:
 
 
 def test_a_control_has_words_where_there_is_no_kernel() -> None:
-    data = controls.EpisodeChoice("tabletop", "put-pouch", 0, "side")._repr_mimebundle_()
+    data = notebook.EpisodeChoice("tabletop", "put-pouch", 0, "side")._repr_mimebundle_()
     assert WIDGET in data
     assert "suite tabletop · task put-pouch · episode 0 · camera side" in data["text/html"]
     assert data["text/plain"] in data["text/html"]
@@ -36,13 +36,13 @@ def test_a_control_has_words_where_there_is_no_kernel() -> None:
 
 def test_a_default_that_is_not_there_is_named() -> None:
     with pytest.raises(UnknownName, match="camera of simpler-bridge"):
-        controls.EpisodeChoice("simpler-bridge", "put-camera", 0, "side")
+        notebook.EpisodeChoice("simpler-bridge", "put-camera", 0, "side")
     with pytest.raises(UnknownName, match="task"):
-        controls.EpisodeChoice("simpler-bridge", "put-nothing", 0, "front")
+        notebook.EpisodeChoice("simpler-bridge", "put-nothing", 0, "front")
 
 
 def test_own_photos_are_kept_as_they_were_chosen(tmp_path: Path) -> None:
-    photos = controls.OwnPhotos(tmp_path / "own", "cup")
+    photos = notebook.OwnPhotos(tmp_path / "own", "cup")
     assert photos.chosen == (None, None, "cup")
     Image.fromarray(np.full((9, 12, 3), 200, np.uint8)).save(tmp_path / "a.png")
     upload = SimpleNamespace(name="A.PNG", content=memoryview((tmp_path / "a.png").read_bytes()))
@@ -79,12 +79,12 @@ def choices() -> pd.DataFrame:
 
 def test_the_least_lead_says_what_is_answered_and_rightly() -> None:
     table = choices()
-    said = controls.answered_text(table, 5, 0.6)
-    assert "0.60: 50 % [24, 76] of 10 views are answered" in said
-    assert ", 80 % [38, 96] of 5 of these rightly." in said
-    assert ": 90 % [60, 98] of 10 views are answered" in controls.answered_text(table, 5, 0.0)
-    control = controls.Abstention(table)
+    control = notebook.Abstention(table)
     before = control.answer.value
+    assert "0.60: 50 % [24, 76] of 10 views are answered" in before
+    assert ", 80 % [38, 96] of 5 of these rightly." in before
+    control.threshold.value = 0.0
+    assert ": 90 % [60, 98] of 10 views are answered" in control.answer.value
     control.k.value = 1
     assert "K = 1" in control.answer.value
     assert control.answer.value != before
@@ -92,4 +92,4 @@ def test_the_least_lead_says_what_is_answered_and_rightly() -> None:
     control.threshold.value = 0.0
     assert ": 75 % [30, 95] of 4 views are answered" in control.answer.value
     with pytest.raises(UnknownName, match="number of photos '2' is unknown; known: 1, 5"):
-        controls.Abstention(table, k=2)
+        notebook.Abstention(table, k=2)

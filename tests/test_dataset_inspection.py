@@ -15,12 +15,6 @@ from tests.command import refused, vap
 from tests.full_disk import full_disk
 from tests.toys import TOYS, SameColour, personal, scene
 from vap_core import memory
-from vap_core.analysis import dataset_inspection
-from vap_core.analysis.dataset_inspection import (
-    _stretches,
-    inspect_dataset,
-    report_table,
-)
 from vap_core.attend import Attender
 from vap_core.base.errors import BadDataset, BadOutput
 from vap_core.perception.embedded import networks
@@ -28,9 +22,12 @@ from vap_core.perception.protocols import Thresholds, keep_thresholds, threshold
 from vap_core.perception.stacks import STACKS
 from vap_core.policies.lerobot.datasets import open_dataset
 from vap_core.recording import read_summary
+from vap_core.study import dataset
+from vap_core.study.dataset import _stretches, inspect_dataset, report_table
 
 BLUE, GREEN = (0, 0, 255), (0, 255, 0)
 CAMERAS = ("top", "wrist")
+SHOWN = ("grounded", "tracked", "losses", "longest")
 TOLD = "bring my mug"
 
 
@@ -99,7 +96,7 @@ def test_losses_are_told_and_every_episode_is_a_recording(
 ) -> None:
     out = tmp_path / "out"
     reports = inspect_dataset(recorded, TOLD, bank, "toys", out)
-    found = {(r.episode, r.camera): (r.grounded, r.tracked, r.losses, r.longest) for r in reports}
+    found = {(row["episode"], row["camera"]): tuple(row[name] for name in SHOWN) for row in reports}
     assert found == {
         (0, "top"): (True, 5, 0, 0),
         (0, "wrist"): (True, 5, 0, 0),
@@ -127,7 +124,7 @@ def test_the_same_call_goes_on_and_another_question_is_refused(
     assert (out / "episode_000000.rrd").stat().st_mtime_ns == kept
     for told, remembered in (("pick my mug", BLUE), (TOLD, GREEN)):
         memory.save(bank, personal("mug", "mug", remembered), replace=True)
-        with pytest.raises(BadOutput, match="holds another inspection.*choose another --out"):
+        with pytest.raises(BadOutput, match="holds another run.*choose another folder with --out"):
             inspect_dataset(recorded, told, bank, "toys", out)
 
 
@@ -138,7 +135,7 @@ def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
     out = tmp_path / "out"
 
     def refuses(differs: str) -> None:
-        with pytest.raises(BadOutput, match=rf"another inspection \({differs} differ\); choose"):
+        with pytest.raises(BadOutput, match=rf"another run \(.*{differs}.*\); choose"):
             inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
 
     monkeypatch.setenv("VAP_WEIGHTS", str(tmp_path / "weights"))
@@ -149,7 +146,7 @@ def test_answers_of_another_threshold_owner_or_version_are_not_taken_for_these(
     refuses("thresholds")
     thresholds_file(tmp_path / "weights", "toys").unlink()
     inspect_dataset(recorded, TOLD, bank, "toys", out, episodes=1)
-    monkeypatch.setattr(dataset_inspection, "__version__", "later")
+    monkeypatch.setattr(dataset, "__version__", "later")
     refuses("version")
 
 
@@ -162,10 +159,10 @@ def test_answers_of_other_parts_or_weights_are_not_taken_for_these(
     other = replace(TOYS, tracker=Elsewhere())
     with monkeypatch.context() as patch:
         patch.setitem(STACKS, "toys", lambda: other)
-        with pytest.raises(BadOutput, match=r"another inspection \(parts differ\); choose another"):
+        with pytest.raises(BadOutput, match=r"another run \(.*parts.*\); choose another"):
             inspect_dataset(*ask, episodes=1)
     monkeypatch.setattr(networks, "weights_sha256", lambda: {"tracker.npz": "0" * 64})
-    with pytest.raises(BadOutput, match=r"another inspection \(weights differ\); choose another"):
+    with pytest.raises(BadOutput, match=r"another run \(.*weights.*\); choose another"):
         inspect_dataset(*ask, episodes=1)
 
 
@@ -183,7 +180,7 @@ def test_answers_of_a_dataset_that_was_replaced_are_not_taken_for_these(
     else:
         (path,) = path.rglob("*.parquet")
         pq.write_table(pq.read_table(path), path, compression="gzip")
-    with pytest.raises(BadOutput, match=r"another inspection \(dataset differ\); choose another"):
+    with pytest.raises(BadOutput, match=r"another run \(.*dataset.*\); choose another"):
         inspect_dataset(dataset, TOLD, bank, "toys", out, episodes=1)
 
 
@@ -208,7 +205,7 @@ def test_an_inspection_is_of_the_owners_that_it_knew(
     ask = (recorded, "bring anna's mug", bank, "toys", tmp_path / "out")
     inspect_dataset(*ask, episodes=1)
     memory.save(bank, replace(mug, **(known | whose)), replace=True)
-    with pytest.raises(BadOutput, match=r"another inspection \(memory differ\); choose another"):
+    with pytest.raises(BadOutput, match=r"another run \(.*memory.*\); choose another"):
         inspect_dataset(*ask, episodes=1)
 
 
@@ -216,7 +213,7 @@ def test_a_damaged_record_of_an_inspection_is_one_line(
     recorded: Path, bank: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "inspection.json").write_text("3")
-    with pytest.raises(BadOutput, match=r"cannot be used .*; choose another --out"):
+    with pytest.raises(BadOutput, match=r"holds no run; choose another folder with --out"):
         inspect_dataset(recorded, TOLD, bank, "toys", tmp_path, episodes=1)
 
 

@@ -6,12 +6,12 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from vap_core.analysis import embeddings as embedding_report
 from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.cli import app
 from vap_core.policies.protocol import SHIPPED, shipped_checkpoint
 from vap_core.policies.tables import token_groups
 from vap_core.simulation import suites
+from vap_core.study import embeddings as embedding_report
 from vap_core.study import tokens
 
 from . import tiny_lerobot

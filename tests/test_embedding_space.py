@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import save_file
 from scipy.stats import ortho_group
 
-from vap_core.analysis.embeddings import compare, paired_cosines
 from vap_core.base.errors import BadPolicy
 from vap_core.policies.tables import open_table
+from vap_core.study.embeddings import compare, paired_cosines
 
 from . import tiny_lerobot
 

@@ -216,10 +216,6 @@ REFUSED = {
         ("eval", *EXPERT, "--audit"),
         "policy 'expert' consumes no prompt; there is nothing to audit",
     ),
-    "an address without ray": (
-        ("eval", *EXPERT, "--address", "127.0.0.1:6379"),
-        "--address needs --engine ray",
-    ),
     "no episodes": (("eval", *EXPERT, "--episodes", "0"), "Invalid value for '--episodes'.*1"),
     "unknown policy": (
         ("eval", "--suite", SUITE, "--policy", "magic"),

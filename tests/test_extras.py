@@ -37,7 +37,7 @@ class Absent(MetaPathFinder):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Absent())
-import vap_core.analysis.ground, vap_core.cli, vap_core.study.engine, vap_core.study.photos
+import vap_core.study.grounding, vap_core.cli, vap_core.study.engine, vap_core.study.photos
 from vap_core import Study, diagnose, make_trial, register_personal
 from vap_core.rollout.loop import rollout
 

@@ -8,19 +8,14 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from vap_core.analysis import gallery
-from vap_core.analysis.gallery import GOALS, STEMS
-from vap_core.analysis.plots import (
-    Tile,
-    hardness_figure,
-    keep,
-    layouts_figure,
-    sheet,
-)
+from vap_core import notebook as gallery
 from vap_core.base.pictures import empty_figure
+from vap_core.notebook import GOALS, STEMS, keep, layouts_figure
+from vap_core.perception.references import crop
 from vap_core.simulation.assets.objects import TIERS, lookalikes, personal_instance
 from vap_core.simulation.studio import PORTRAIT, Shot, Stage, photograph
 from vap_core.simulation.suites import BENCHMARKS, VARIANTS, lists
+from vap_core.study.charts import Tile, sheet
 from vap_make.objects import generic_instance
 
 CUP, PLANT = personal_instance("cup"), personal_instance("plant")
@@ -49,17 +44,6 @@ def test_the_stage_takes_the_studio_s_pictures(stage):
         assert np.array_equal(stage.picture(CUP.name, shot), photograph(CUP, [shot], 96)[0])
 
 
-def test_a_cut_is_the_object_and_little_else(stage):
-    whole, cut = stage.picture(PLANT.name, ASIDE), gallery.cut(stage, PLANT.name, ASIDE)
-    assert cut.shape[0] < whole.shape[0]
-    assert cut.shape[1] < whole.shape[1]
-    assert any(
-        np.array_equal(whole[i : i + cut.shape[0], j : j + cut.shape[1]], cut)
-        for i in range(whole.shape[0] - cut.shape[0] + 1)
-        for j in range(whole.shape[1] - cut.shape[1] + 1)
-    )
-
-
 def test_every_personal_object_has_a_row_from_hard_to_easy():
     assert len(STEMS) == len(set(STEMS)) == 19
     for stem in STEMS:
@@ -85,8 +69,18 @@ def test_hardness_is_the_mean_cosine(stage, monkeypatch):
     monkeypatch.setattr(gallery, "STEMS", ("cup",))
     monkeypatch.setattr(gallery, "lookalikes_by_tier", lambda stem: lookalikes(stem)[:2])
     table = gallery.hardness(stage, Mean())
-    references = Mean()([gallery.cut(stage, CUP.name, shot) for shot in gallery.REFERENCES])
-    one = Mean()([gallery.cut(stage, table.lookalike[0], shot) for shot in gallery.QUERIES])
+    references = Mean()(
+        [
+            crop(stage.picture(CUP.name, shot), stage.box(CUP.name, shot))
+            for shot in gallery.REFERENCES
+        ]
+    )
+    one = Mean()(
+        [
+            crop(stage.picture(table.lookalike[0], shot), stage.box(table.lookalike[0], shot))
+            for shot in gallery.QUERIES
+        ]
+    )
     assert table.cosine[0] == pytest.approx(float((one @ references.T).mean()))
     assert table.own.nunique() == 1
     assert table.fooled.between(0, 1).all()
@@ -178,48 +172,7 @@ def test_a_plot_is_kept_as_an_svg_too_the_same_each_time(tmp_path):
     assert not (tmp_path / "c.svg").exists(), "too large"
 
 
-def test_bounds_are_read_in_the_suites_order_and_pooled(tmp_path):
-    one = {
-        "method": "generic",
-        "outcome": "success",
-        "cmr": None,
-        "wrong_object": False,
-        "first_object_correct": True,
-        "steps": 3,
-        "split": "",
-    }
-    tasks = [
-        ("tabletop", "select-cup", True),
-        ("simpler-bridge", "put-camera", False),
-        ("simpler-bridge", "pick-shaver", True),
-    ]
-    pd.DataFrame(
-        [{**one, "suite": suite, "task": task, "policy": policy, "success": done and policy == "expert"}
-         for suite, task, done in tasks for policy in ("random", "expert")]
-    ).to_parquet(tmp_path / "bounds.parquet")  # fmt: skip
-    scores = gallery.bounds(tmp_path / "bounds.parquet")
-    assert [(s.task, s.policy) for s in scores[:3]] == [
-        ("pick-shaver", "expert"),
-        ("pick-shaver", "random"),
-        ("put-camera", "expert"),
-    ]
-    assert scores[-1].suite == "tabletop"
-    table = gallery.bounds_table(scores)
-    assert list(table.columns) == [
-        "expert, SR %",
-        "expert, least in",
-        "expert, SR % in that task",
-        "random, SR %",
-        "random, most in",
-        "random, SR % in that task",
-    ]
-    assert table.map(len).to_numpy().max() < 50, "pandas cuts what is longer"
-    assert table.loc["simpler-bridge", "random, SR %"].startswith("0 % [0, ")
-    assert table.loc["simpler-bridge", "random, SR %"].endswith(" of 2")
-    assert table.loc["simpler-bridge", "expert, least in"] == "put-camera"
-
-
-def test_layouts_and_hardness_draw():
+def test_layouts_draw():
     built = {name: lists.read(name) for name in ("simpler-bridge", "tabletop")}
     figure = layouts_figure(built, dict.fromkeys(built, (0.0, -0.5, 0.8, 0.5)))
     assert len(figure.axes) == 2
@@ -232,7 +185,3 @@ def test_layouts_and_hardness_draw():
     marks = [each for each in figure.legends[0].legend_handles if hasattr(each, "get_sizes")]
     assert len(marks) == 4
     assert min(mark.get_sizes()[0] for mark in marks) >= 30, "a legend's dots can be seen"
-    table = pd.DataFrame(
-        {"object": ["cup"] * 2, "tier": ["hard", "easy"], "cosine": [0.9, 0.5], "own": [0.95] * 2}
-    )
-    assert len(hardness_figure(table).axes[0].collections) == 3

@@ -11,8 +11,6 @@ from PIL import Image
 
 from tests.command import refused, vap
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
-from vap_core.analysis import ground, ground_clip
-from vap_core.analysis.ground import claimed_paths
 from vap_core.attend import Attender
 from vap_core.base import media
 from vap_core.base.errors import BadOutput
@@ -23,6 +21,8 @@ from vap_core.perception.boxes import GRID, TiledDetector, tile_corners
 from vap_core.perception.protocols import Stack
 from vap_core.recording import show as film_pictures
 from vap_core.recording import write_film
+from vap_core.study import grounding
+from vap_core.study.grounding import claimed_paths
 
 RED, GREEN = (250, 0, 0), (0, 250, 0)
 
@@ -46,7 +46,7 @@ def frames(folder: Path, squares) -> Path:
 def test_stretches_without_the_object_that_are_not_named_are_counted():
     def said(n: int) -> str:
         lost = tuple((2 * i, 2 * i) for i in range(1, n + 1))
-        summary = ground_clip.ClipSummary(
+        summary = grounding.ClipSummary(
             frames=40, grounded=0, tracked=40 - n, lost=lost, text="bring it", object="mug"
         )
         return str(summary).splitlines()[1]
@@ -73,7 +73,7 @@ def test_a_folder_of_frames_is_tracked_through(bank, tmp_path):
     assert "instruction: bring the " in done.stdout
     film = list(media.frames(tmp_path / "clip.mp4"))
     assert len(film) == 9
-    assert media.frame_rate(tmp_path / "clip.mp4") == ground_clip.FOLDER_HZ
+    assert media.frame_rate(tmp_path / "clip.mp4") == grounding.FOLDER_HZ
     changed = np.abs(film[5].astype(int) - scene(squares[5])).mean(axis=2) > 60
     assert changed[10:22, 40:52].mean() > 0.5
     assert changed[4:16, 4:16].mean() < 0.2
@@ -150,7 +150,7 @@ def test_always_tint_reaches_a_clip(bank, tmp_path, monkeypatch):
             asked.append(prompting.always_tint)
             super().__init__(stack, memory, prompting, **how)
 
-    monkeypatch.setattr(ground_clip, "Attender", Asked)
+    monkeypatch.setattr(grounding, "Attender", Asked)
     clip = frames(tmp_path / "clip", [[(26, 26, RED)]] * 2)
     where = ("--stack", "toy", "--memory", bank, "--out", tmp_path / "out")
     for option in ((), ("--always-tint",)):
@@ -288,7 +288,7 @@ def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
 def test_a_picture_is_tiled_by_the_size_of_its_file(bank, tmp_path, monkeypatch, width, tiled):
     """A long one is shrunk below the limit before it is looked at."""
     monkeypatch.setattr(boxes, "SMALL_MEGAPIXELS", 0.07)
-    monkeypatch.setattr(ground, "GROUND_SIDE", 256)
+    monkeypatch.setattr(grounding, "GROUND_SIDE", 256)
     rgb = np.zeros((180, width, 3), np.uint8)
     rgb[90:130, 200:240] = RED
     Image.fromarray(rgb).save(tmp_path / "long.png")

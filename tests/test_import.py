@@ -56,7 +56,6 @@ def test_type_checkers_see_the_names_that_load() -> None:
 @pytest.mark.parametrize(
     "package",
     [
-        "vap_core.analysis",
         "vap_core.study",
         "vap_core.rollout",
         "vap_core.simulation",

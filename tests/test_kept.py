@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from vap_core.analysis import kept
+from vap_core import notebook
 from vap_core.base.files import code_digest
 
 
@@ -23,22 +23,22 @@ def refuse() -> Figure:
 
 def test_a_figure_is_drawn_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "figure.png"
-    first = kept.kept_figure(path, draw)
+    first = notebook.kept_figure(path, draw)
     assert Image.open(BytesIO(first)).size == (220, 110)
-    assert kept.kept_figure(path, refuse) == first
+    assert notebook.kept_figure(path, refuse) == first
     with pytest.raises(AssertionError, match="drawn again"):
-        kept.kept_figure(path, refuse, again=True)
-    monkeypatch.setattr(kept, "source_digest", lambda: "other code")
+        notebook.kept_figure(path, refuse, again=True)
+    monkeypatch.setattr(notebook, "made_from", lambda: "other code")
     with pytest.raises(AssertionError, match="drawn again"):
-        kept.kept_figure(path, refuse)
+        notebook.kept_figure(path, refuse)
 
 
 def test_a_table_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "table.parquet"
-    made = kept.kept_table(path, lambda: pd.DataFrame({"n": [1, 2]}))
-    assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).equals(made)
-    monkeypatch.setattr(kept, "source_digest", lambda: "other code")
-    assert kept.kept_table(path, lambda: pd.DataFrame({"n": [3]})).n.tolist() == [3]
+    made = notebook.kept_table(path, lambda: pd.DataFrame({"n": [1, 2]}))
+    assert notebook.kept_table(path, lambda: pd.DataFrame({"n": [3]})).equals(made)
+    monkeypatch.setattr(notebook, "made_from", lambda: "other code")
+    assert notebook.kept_table(path, lambda: pd.DataFrame({"n": [3]})).n.tolist() == [3]
 
 
 def test_what_is_committed_was_made_from_what_ships() -> None:
@@ -46,10 +46,10 @@ def test_what_is_committed_was_made_from_what_ships() -> None:
     root = Path(__file__).parents[1]
     for name in ("objects", "generics", "references"):
         with Image.open(root / f"figures/01_benchmark_building_{name}.png") as picture:
-            assert picture.info[kept.KEY] == kept.source_digest(), "execute notebook 01 again"
+            assert picture.info[notebook.KEY] == notebook.made_from(), "execute notebook 01 again"
     for name in ("lookalike_hardness", "reference_crops"):
         about = pq.read_schema(root / f"data/results/{name}.parquet").metadata
-        assert about[kept.KEY.encode()].decode() == kept.source_digest(), "execute notebook 01"
+        assert about[notebook.KEY.encode()].decode() == notebook.made_from(), "execute notebook 01"
 
 
 def test_a_comment_does_not_change_the_digest_of_code(tmp_path: Path) -> None:

@@ -23,13 +23,13 @@ from tests.random_kills import Server, kill_in, serving
 from tests.test_report import run
 from tests.test_scan_storage import METADATA, cube
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
-from vap_core.analysis.ground_clip import ground_clip
 from vap_core.base import media
 from vap_core.memory import remember, save
 from vap_core.perception import stacks
 from vap_core.perception.protocols import Stack
 from vap_core.recording import read_summary
 from vap_core.simulation.assets.scans import storage
+from vap_core.study.grounding import ground_clip
 from vap_core.study.report import report
 
 
@@ -107,7 +107,7 @@ from pathlib import Path
 Path("kernel").write_text(str(os.getpid()))
 import pandas as pd
 from matplotlib.figure import Figure
-from vap_core.analysis.kept import kept_figure, kept_table""",
+from vap_core.notebook import kept_figure, kept_table""",
     """for i in range(20):
     kept_table(Path(f"table{i}.parquet"), lambda: pd.DataFrame({"n": range(20_000 + i)}), again=True)
     kept_figure(Path(f"figure{i}.png"), lambda: Figure(figsize=(4, 3)), again=True)""",

@@ -11,7 +11,6 @@ from vap_core.study.store import (
     publish_tables,
     read_json_part,
     write_json_part,
-    write_table,
 )
 
 
@@ -28,12 +27,6 @@ def test_tables_that_cannot_be_published_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(BadOutput, match="survey: .* choose another folder with --publish"):
         publish_tables({"a.parquet": b"a"}, tmp_path / "file", caller="survey")
-
-
-def test_a_table_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(BadOutput, match=r"views: .*/file cannot be written \(Not a directory\)"):
-        write_table(pd.DataFrame({"n": [1]}), tmp_path / "file", "views")
 
 
 def test_rows_are_not_added_to_a_damaged_table(tmp_path: Path) -> None:

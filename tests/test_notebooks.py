@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vap_core.analysis import notebook_links, notebook_pages
 from vap_core.base.errors import BadOutput
-from vap_core.recording.show import free_port
+from vap_make import pages as notebook_links
+from vap_make import pages as notebook_pages
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
@@ -118,7 +118,7 @@ def test_the_map_holds_every_notebook() -> None:
         assert f"[{title}]({path.name})" in table
         assert notebook_links.question(READ[path]), f"{path.name} asks no question"
     assert len(LINK.findall(table)) == len(FILES)
-    assert table == notebook_links.map_text(READ), "python -m vap_core.analysis.notebook_links"
+    assert table == notebook_links.map_text(READ), "python -m vap_make.pages links"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
@@ -134,7 +134,7 @@ def test_a_notebook_leads_to_its_neighbours(path: Path) -> None:
     cells = markdown(path)
     line = notebook_links.links_text(path, TITLES)
     assert cells[notebook_links.TOP_ID] == cells[notebook_links.END_ID] == line, (
-        "python -m vap_core.analysis.notebook_links"
+        "python -m vap_make.pages links"
     )
     assert READ[path]["cells"][1]["id"] == notebook_links.TOP_ID
 

@@ -17,8 +17,8 @@ from vap_core import get_object, reference_views
 from vap_core.base.errors import MissingGL
 from vap_core.recording import Recorder, show, stream
 from vap_core.recording.stream import rerun_command, rerun_environment
-from vap_core.study.cluster import ray_executor
 from vap_core.study.trials import shipped
+from vap_core.study.workers import ray_executor
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from tqdm import tqdm
 
 from tests.command import refused, vap
 from tests.scanned import box, put
@@ -16,10 +15,9 @@ from vap_core.base.errors import BadObject, BadStudy
 from vap_core.simulation.assets.scans.storage import VARIABLE
 from vap_core.study import objects as own
 from vap_core.study.objects import (
-    Source,
-    Tables,
-    group_rows,
-    object_rows,
+    ObjectMeasurement,
+    group_table,
+    object_table,
     objects_in,
     read_source,
     text_report,
@@ -155,17 +153,17 @@ def test_rows_count_what_they_say():
             {"object": "pot", "expert": False, "success": True, "first_object_correct": True},
         ]
     )
-    tables = Tables(
-        views=views, episodes=episodes, groups={"mug": ("loud",), "pot": ()}, refused={"x": "no"}
-    )
-    assert object_rows(tables)[1:] == [
-        ["mug", "3", "3", "2", "1", "1", "0.90", "2 of 2", "1 of 2"],
-        ["pot", "1", "0", "0", "0", "0", "-", "0 of 1", "0 of 0"],
+    refused = pd.DataFrame([{"object": "x", "why": "no"}])
+    tables = {"views": views, "episodes": episodes, "refused": refused}
+    groups: dict[str, tuple[str, ...]] = {"mug": ("loud",), "pot": ()}
+    assert object_table(tables).to_numpy().tolist() == [
+        ["mug", 3, 3, 2, 1, 1, "0.90", "2 of 2", "1 of 2"],
+        ["pot", 1, 0, 0, 0, 0, "-", "0 of 1", "0 of 0"],
     ]
-    by_name = {cells[0].strip("- "): cells[1:] for cells in group_rows(tables)[1:]}
-    assert list(by_name) == ["all", "front views", "side views", "wrist views", "loud"]
-    head = group_rows(tables)[0][1:]
-    of_all = dict(zip(head, by_name["all"], strict=True))
+    found = group_table(tables, groups)
+    by_name = found.set_index(found.iloc[:, 0].str.strip("- "))
+    assert list(by_name.index) == ["all", "front views", "side views", "wrist views", "loud"]
+    of_all = by_name.loc["all"]
     assert of_all["proposed"].startswith("75 ")
     assert of_all["right"].startswith("50 ")
     assert of_all["not in view"].startswith("50 ")
@@ -173,10 +171,10 @@ def test_rows_count_what_they_say():
     assert of_all["wrong tint"].startswith("20 ")
     assert of_all["VAP"].startswith("50 ")
     assert of_all["VAP"].endswith(" 2")
-    assert by_name["loud"][0].startswith("100 ")
-    assert "left out: x: no" in text_report(tables)
-    nothing = Tables(views=views, episodes=pd.DataFrame(), groups=tables.groups, refused={})
-    assert object_rows(nothing)[1][-2:] == ["-", "-"]
+    assert by_name.loc["loud", "proposed"].startswith("100 ")
+    assert "left out: x: no" in text_report(tables, groups)
+    nothing = {**tables, "episodes": pd.DataFrame()}
+    assert object_table(nothing).iloc[0, -2:].tolist() == ["-", "-"]
 
 
 def test_folders_that_are_none_are_one_line(tmp_path: Path):
@@ -186,24 +184,22 @@ def test_folders_that_are_none_are_one_line(tmp_path: Path):
 
 
 def test_an_object_that_is_left_out_at_a_later_task_has_no_rows(tmp_path, monkeypatch):
-    def views(study, out, stack):
-        if (study.object, study.tasks[0][1]) == ("wide", "select-shoe"):
+    def openings(rows, stack):
+        if rows == ["wide", "select-shoe"]:
             raise BadStudy("too wide")
-        return [{"object": study.object}]
-
-    tasks = [("vlabench", "select-mug"), ("vlabench", "select-shoe")]
-    monkeypatch.setattr(own, "load_stack", lambda name: None)
-    monkeypatch.setattr(own, "_tasks", lambda name, suites: tasks)
-    monkeypatch.setattr(own, "_views", views)
-    monkeypatch.setattr(own, "_episodes", lambda study, out: views(study, out, None))
+        return [{"object": rows[0]}], np.zeros((4, 4, 3), np.uint8)
 
     def study(asked, suite, task, name):
-        return SimpleNamespace(object=name, tasks=((suite, task),))
+        return SimpleNamespace(object=name, rows=lambda suite, task: [name, task])
 
-    monkeypatch.setattr(own.ObjectSurvey, "study", study)
-    asked = own.ObjectSurvey(suites=("vlabench",))
-    source = Source(groups={"wide": (), "slim": ()}, files={}, sha256="")
-    refused: dict[str, str] = {}
-    seen, played = own._measure(source, tmp_path, asked, refused, tqdm(disable=True))
-    assert refused == {"wide": "too wide"}
-    assert seen["object"].tolist() == played["object"].tolist() == ["slim", "slim"]
+    tasks = (("vlabench", "select-mug"), ("vlabench", "select-shoe"))
+    monkeypatch.setattr(own, "_load_stack", lambda name: None)
+    monkeypatch.setattr(own.suites, "tasks_of", lambda suites, name: tasks)
+    monkeypatch.setattr(own, "measure_openings", openings)
+    monkeypatch.setattr(own.ObjectMeasurement, "study", study)
+    asked = ObjectMeasurement(tmp_path, suites=("vlabench",), views_only=True)
+    (tmp_path / "parts").mkdir()
+    wide, slim = (asked.run(own.Job(name), tmp_path) for name in ("wide", "slim"))
+    assert wide["refused"] == [{"object": "wide", "why": "too wide"}]
+    assert not wide["views"]
+    assert [row["object"] for row in slim["views"]] == ["slim", "slim"]

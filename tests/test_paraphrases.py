@@ -1,6 +1,7 @@
 """Paraphrased instructions by families, and the command that scores parsers on them."""
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -19,8 +20,7 @@ from vap_core.study.parsers import (
     KINDS,
     PARTS,
     Paraphrase,
-    answer_table,
-    measure,
+    ParserMeasurement,
     paraphrase_digest,
     paraphrases,
     read_families,
@@ -113,27 +113,31 @@ def test_rates_are_counted_exactly(
 
         return parser
 
-    table = answer_table(measure("known", load, ["simpler-bridge"], ["tune"]))
+    monkeypatch.setattr(parsers, "load_parser", lambda name, context: load(context))
+    asked = ParserMeasurement(("known",), ("simpler-bridge",), ("tune",))
+    table = pd.DataFrame(asked.rows())
     personal = table[table["kind"] != "none"]
     assert personal["right"].all()
     assert personal["kept"].all()
     assert not table[table["kind"] == "none"]["right"].any()
-    lines = {row[2]: row for row in parsers.rows(table)[1:]}
-    n = len(table)
-    assert lines["none"][5:8] == ["0 % [0, 14] [0, 41]", "0 %", "100 %"]
-    assert lines["all"][4] == str(n)
-    assert lines["all"][7] == f"{100 * (n - len(personal)) / n:.0f} %"
+    found = parsers.accuracy(table).set_index("kind")
+    none, whole, n = found.loc["none"], found.loc["all"], len(table)
+    assert str(none["right"]) == "0 % [0, 14]"
+    assert (none["low"], round(none["high"], 2)) == (0, 0.41)
+    assert (none["abstains"].value, none["wrong object"].value, whole["n"]) == (0, 1, n)
+    assert whole["wrong object"].k == n - len(personal)
 
 
-def test_a_server_that_fails_is_no_abstention() -> None:
+def test_a_server_that_fails_is_no_abstention(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(context: Context):
         def parser(text: str, categories: object = ()) -> Instruction:
             raise BadEndpoint("down")
 
         return parser
 
+    monkeypatch.setattr(parsers, "load_parser", lambda name, context: load(context))
     with pytest.raises(BadEndpoint, match="down"):
-        measure("down", load, ["tabletop"], ["tune"], 1)
+        ParserMeasurement(("down",), ("tabletop",), ("tune",), 1).rows()
 
 
 def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
@@ -146,7 +150,7 @@ def test_the_command_prints_and_publishes(tmp_path: Path) -> None:
     about = json.loads((table.schema.metadata or {})[b"about"])
     assert about["paraphrases"] == paraphrase_digest()
     assert "suite 'lab' is unknown; known: " in refused("measure", "parsers", "--suite", "lab")
-    assert "',' names no parser" in refused("measure", "parsers", "--parser", ",")
+    assert "no parser is named" in refused("measure", "parsers", "--parser", ",")
     assert "part 'all' is unknown; known: check-1" in refused("measure", "parsers", "--part", "all")
     assert "'magic' is unknown; known: rule" in refused(
         "measure", "parsers", *some, "--parser", "magic"
@@ -165,8 +169,18 @@ def test_the_page_quotes_the_published_table() -> None:
     page = (ROOT / "docs" / "instructions.md").read_text()
     table: pd.DataFrame = pq.read_table(PUBLISHED).to_pandas()
     held_out = table[table["part"] == "test"]
-    for row in parsers.rows(held_out)[1:]:
-        assert (
-            f"| {row[0]} | {row[2]} | {row[3]} | {row[4]} | {row[5]} | {row[6]} | {row[7]} |"
-            in page
-        )
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in page.splitlines()
+        if re.match(r"\| (rule|embedding) \| (?!test)", line)
+    ]
+    shown = {(row[0], row[1]): row[2:] for row in rows if len(row) == 7}
+    found = parsers.accuracy(held_out)
+    assert len(shown) == len(found)
+    for line in found.to_dict("records"):
+        families, n, right, silent, wrong = shown[line["parser"], line["kind"]]
+        assert (families, n) == (str(line["families"]), str(line["n"]))
+        ends = f"[{100 * line['low']:.0f}, {100 * line['high']:.0f}]"
+        assert right == f"{line['right']} {ends}"
+        for text, share in ((silent, line["abstains"]), (wrong, line["wrong object"])):
+            assert text == f"{100 * share.value:.0f} %"

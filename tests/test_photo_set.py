@@ -17,20 +17,19 @@ from vap_core.base.files import DATA
 from vap_core.perception.protocols import Stack
 from vap_core.study import photos
 from vap_core.study.photos import (
-    clustered_mean,
     evidence,
     follow_scene,
     mask_rows,
     measure_scene,
-    object_rows,
+    object_table,
     read_photo_set,
-    scene_rows,
+    scene_table,
     single_report,
     single_rows,
-    vote_rows,
+    vote_table,
 )
 from vap_core.study.register import fit_line, join_tiles, labelled
-from vap_core.study.stats import clustered_share, rate
+from vap_core.study.stats import clustered_share, mean_by, rate
 
 RED, GREEN, BLUE, DARK = (250, 0, 0), (0, 250, 0), (0, 0, 250), (120, 10, 0)
 HEADER = "scene,object,x0,y0,x1,y1\n"
@@ -256,26 +255,28 @@ def test_rows_count_what_they_say():
             row(scene="e", present=False, iou=0.0, chosen_iou=None, tinted=False, object="plant"),
         ]
     )
-    assert object_rows(table)[1:] == [
-        ["mug", "cup", "3", "1", "2", "1", "1", "1", "1"],
-        ["plant", "cup", "0", "0", "0", "0", "0", "1", "0"],
-        ["all", "", "3", "1", "2", "1", "1", "2", "1"],
+    assert object_table(table).to_numpy().tolist() == [
+        ["mug", "cup", 3, 1, 2, 1, 1, 1, 1],
+        ["plant", "cup", 0, 0, 0, 0, 0, 1, 0],
+        ["all", "", 3, 1, 2, 1, 1, 2, 1],
     ]
-    by_name = {cells[0].strip("- "): cells[1:] for cells in scene_rows(table)[1:]}
-    assert by_name["object in view"][0].startswith("67 ")
-    assert by_name["object in view"][1].startswith("33 ")
-    assert scene_rows(table)[0][6] == "not in view"
-    assert by_name["object in view"][5].startswith("50 ")
-    assert by_name["object in view"][5].endswith(" 2")
-    assert by_name["object absent"][5] == ""
-    assert by_name["beside look-alikes"][3].startswith("100 ")
-    assert by_name["look-alikes in view"][3].startswith("100 ")
-    assert by_name["none of its kind"][4].startswith("100 ")
-    assert vote_rows(table)[1] == ["all true boxes", "-", "-", "-", "-"]
+    found = scene_table(table)
+    by_name = found.assign(scenes=found["scenes"].str.strip("- ")).set_index("scenes")
+    assert by_name.loc["object in view", "proposed"].startswith("67 ")
+    assert by_name.loc["object in view", "right"].startswith("33 ")
+    not_in_view = by_name.loc["object in view", "not in view"]
+    assert not_in_view.startswith("50 ")
+    assert not_in_view.endswith(" 2")
+    assert by_name.loc["object absent", "not in view"] == ""
+    assert by_name.loc["beside look-alikes", "wrong tinted"].startswith("100 ")
+    assert by_name.loc["look-alikes in view", "wrong tinted"].startswith("100 ")
+    assert by_name.loc["none of its kind", "silent"].startswith("100 ")
+    assert vote_table(table).iloc[0].tolist() == ["all true boxes", "-", "-", "-", "-"]
     votes = table.assign(all_boxes=[4, 2, None, None, None], all_one=[0.5, 1, None, None, None])
     votes["all_every"] = [True, False, None, None, None]
-    assert vote_rows(votes)[1][1:3] == ["3.0", "38"]
-    assert vote_rows(votes)[1][3].startswith("75 ")
+    _, boxes, chance, one, _ = vote_table(votes).iloc[0]
+    assert (boxes, chance) == ("3.0", "38")
+    assert one.startswith("75 ")
 
 
 def test_the_interval_of_independent_cases_is_wilsons_and_clusters_widen_it():
@@ -340,12 +341,14 @@ def test_masks_that_do_not_fit_are_named(folder, toy, tmp_path):
 
 
 def test_the_mean_of_clusters_has_the_interval_of_drawing_them_again():
-    spread = clustered_mean(np.array([0.0, 1.0, 0.0, 1.0]), list("abcd"))
-    alike = clustered_mean(np.array([0.0, 1.0, 0.0, 1.0]), list("aabb"))
+    def mean(values, scenes):
+        return mean_by(pd.DataFrame({"iou": values, "scene": list(scenes)}), "iou", ["scene"])
+
+    spread, alike = mean([0.0, 1.0, 0.0, 1.0], "abcd"), mean([0.0, 1.0, 0.0, 1.0], "aabb")
     assert (spread.value, spread.n) == (0.5, 4)
     assert spread.low < 0.5 < spread.high
     assert (alike.low, alike.high) == (0.5, 0.5)
-    assert np.isnan(clustered_mean(np.ones(3), list("aaa")).low)
+    assert np.isnan(mean(np.ones(3), "aaa").low)
 
 
 def test_left_out_photos_are_elected_against_two_others():

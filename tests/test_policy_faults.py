@@ -22,8 +22,8 @@ from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.types import Episode
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import engine, trials
-from vap_core.study.processes import results
 from vap_core.study.trials import Study, make_trial
+from vap_core.study.workers import results
 
 STUDY = Study((("simpler-bridge", "pick-shaver"),), ("generic",), policy="random", episodes=3)
 ROWS = tuple(replace(row, max_steps=3) for row in STUDY.rows("simpler-bridge", "pick-shaver"))

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 COLLECTS = """
-from vap_core.study.processes import prepare
-from vap_core.study.processes import results
+from vap_core.study.workers import prepare
+from vap_core.study.workers import results
 
 prepare(("json",))
 asked = "(lambda gc: (gc.isenabled(), gc.get_freeze_count() > 1000))(__import__('gc'))"

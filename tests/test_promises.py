@@ -102,18 +102,16 @@ def damaged(path: Path) -> Path:
 
 
 def test_a_damaged_table_is_one_line_wherever_it_is_read(tmp_path: Path) -> None:
-    from vap_core.analysis import inspection
-    from vap_core.study import attention, logs, tokens
+    from vap_core.study import attention, logs, survey
 
     for name in attention.TABLES:
         damaged(tmp_path / f"{attention.PREFIX}{name}.parquet")
-    for name in inspection.TABLES:
+    for name in survey.TABLES:
         damaged(tmp_path / f"perception_{name}.parquet")
     damaged(tmp_path / "traces" / "a.parquet")
     damaged(tmp_path / "audit" / "a.parquet")
-    damaged(tmp_path / tokens.TABLES[0] / "a.parquet")
     for read in (
-        attention.read, inspection.published, logs.read_audit, logs.read_states, tokens.read,
+        attention.read, survey.published, logs.read_audit, logs.read_states,
     ):  # fmt: skip
         with pytest.raises(BadOutput, match=r"parquet is damaged; ") as told:
             list(read(tmp_path))

@@ -6,14 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.toys import TOYS, observation, personal, scene
-from vap_core.analysis.prompt_forms import (
-    forms_figure,
-    marked_frames,
-    tinted_frames,
-    tints_figure,
-)
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Camera
+from vap_core.notebook import marked_frames, tinted_frames
 from vap_core.prompt import PALETTE, Tint, has_colour, tint
 from vap_core.rollout.prompters import PromptContext, spoil
 from vap_core.simulation import suites
@@ -172,9 +167,6 @@ def test_every_form_is_shown_on_one_frame() -> None:
     assert len({frame.shape for frame in frames.values()}) == 1
     pictures = {frame.tobytes() for frame in frames.values()}
     assert len(pictures) == len(frames), "no two forms look the same"
-    assert len(
-        forms_figure(suites.rows("simpler-bridge", "put-camera", n=1)[0]).axes[0].images
-    ) == len(frames)
 
 
 def test_the_chosen_tint_is_none_that_a_red_look_alike_has() -> None:
@@ -191,4 +183,3 @@ def test_the_chosen_tint_is_none_that_a_red_look_alike_has() -> None:
     assert red_share["no tint"] > 0.01, "the look-alike is red by nature"
     assert red_share[always] > red_share["no tint"]
     assert f"chosen: {RED.name}" in tinted_frames(plain), "nothing is red there"
-    assert len(tints_figure(row).axes[0].images) == 3

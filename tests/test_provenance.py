@@ -30,14 +30,12 @@ def test_the_command_of_a_run_is_told() -> None:
         command_line({**study, "seeds": 5, "images_every": 0, "audit": True})
         == f"{told} --seeds 5 --audit"
     )
-    assert (
-        command_line({**study, "seeds": 1, "follow": "step", "images_every": 4})
-        == f"{told} --follow step --images-every 4"
-    )
+    assert command_line({**study, "seeds": 1, "follow": "step"}) == f"{told} --follow step"
     assert (
         command_line({**study, "split": "visual matching", "temperature": 0.5})
         == f"{told} --split 'visual matching' --temperature 0.5"
     )
+    assert "images_every=4" in command_line({**study, "images_every": 4})
     demo = [["widowx-pick", "pick-straw-cup"], ["franka-pick", "pick-cup"]]
     assert (
         command_line({**study, "tasks": demo, "episodes": 20})

@@ -116,16 +116,6 @@ def test_methods_that_are_finished_need_not_wait_for_the_others(tmp_path: Path) 
     assert not (tmp_path / "other.parquet").exists()
 
 
-def test_an_unfinished_run_of_another_suite_is_not_asked_for(tmp_path: Path) -> None:
-    whole = run(tmp_path / "one", 0)
-    half = tmp_path / "half"
-    study = {"tasks": [["franka-pick", "pick-cup"]], "methods": ["vap"], "episodes": 5}
-    open_run(half, {**study, "seed": 0, "policy": "scripted"})
-    target = tmp_path / "t.parquet"
-    assert publish([whole, half], target, suite_names=["widowx-pick"]) > 0
-    assert {episodes.suite.iloc[0] for _, episodes in read_runs(target)} == {"widowx-pick"}
-
-
 def test_only_finished_runs_and_each_once(tmp_path: Path) -> None:
     whole, half = run(tmp_path / "one", 0), run(tmp_path / "half", 1, episodes=5, done=3)
     with pytest.raises(
@@ -164,61 +154,10 @@ def test_a_published_table_and_a_new_run_become_one_table(tmp_path: Path) -> Non
         publish([old, tmp_path / "one"], both, replace=True)
 
 
-def test_a_method_that_was_read_again_takes_the_place_of_the_earlier_rows(tmp_path: Path) -> None:
-    old, new = tmp_path / "old.parquet", tmp_path / "new.parquet"
-    publish([run(tmp_path / "both", 0, methods=("generic", "vap"))], old)
-    again = run(tmp_path / "again", 0, methods=("vap",), version="2")
-    with pytest.raises(BadOutput, match="or pass --supersede to keep the later ones"):
-        publish([old, again], new)
-    assert publish([old, again], new, supersede=True) == 4
-    table = pq.read_table(new)
-    by_method = dict(zip(table["method"].to_pylist(), table["steps"].to_pylist(), strict=True))
-    assert by_method == {"generic": 1, "vap": 2}
-    first, second = json.loads(table.schema.metadata[b"runs"])
-    assert first["configuration"]["methods"] == ["generic"]
-    assert first["superseded"] == [{"methods": ["vap"], "by": second["digest"]}]
-    assert publish([new], new, replace=True) == 4, "the table is whole without the earlier rows"
-    everything = run(tmp_path / "all", 0, methods=("generic", "vap"), version="3")
-    assert publish([new, everything], new, replace=True, supersede=True) == 4
-    assert len(json.loads(pq.read_schema(new).metadata[b"runs"])) == 1
-
-
-def test_another_policy_supersedes_nothing(tmp_path: Path) -> None:
-    one = run(tmp_path / "one", 0, methods=("generic", "vap"))
-    other = run(tmp_path / "other", 0, methods=("vap",), version="2", policy="another")
-    assert publish([one, other], tmp_path / "t.parquet", supersede=True) == 6
-
-
-def test_a_part_of_a_list_supersedes_nothing(tmp_path: Path) -> None:
-    whole = run(tmp_path / "whole", 0)
-    part = run(tmp_path / "part", 0, episodes=1, done=1, version="2")
-    with pytest.raises(BadOutput, match="only a part of the episodes of generic"):
-        publish([whole, part], tmp_path / "t.parquet", supersede=True)
-
-
-def test_two_parts_supersede_a_whole_list_together(tmp_path: Path) -> None:
-    whole = run(tmp_path / "whole", 0, methods=("generic", "vap"))
-    parts = []
-    for i in range(2):
-        part = run(tmp_path / f"part-{i}", 0, episodes=1, done=1, methods=("vap",), version=str(2 + i), first=i)  # fmt: skip
-        parts.append(part)
-    target = tmp_path / "t.parquet"
-    assert publish([whole, *parts], target, supersede=True) == 4
-    table = pq.read_table(target).to_pandas()
-    of_vap = table[table["method"] == "vap"]
-    assert dict(zip(of_vap["episode"], of_vap["steps"], strict=True)) == {0: 2, 1: 3}
-    older, one, other = json.loads(pq.read_schema(target).metadata[b"runs"])
-    assert older["configuration"]["methods"] == ["generic"]
-    assert older["superseded"] == [
-        {"methods": ["vap"], "by": one["digest"]},
-        {"methods": ["vap"], "by": other["digest"]},
-    ]
-
-
-def test_of_a_run_only_the_methods_and_suites_that_are_named_are_taken(tmp_path: Path) -> None:
+def test_of_a_run_only_the_methods_that_are_named_are_taken(tmp_path: Path) -> None:
     folder = run(tmp_path / "run", 0, methods=("generic", "vap", "soft"))
     target = tmp_path / "part.parquet"
-    assert publish([folder], target, methods=["vap", "generic"], suite_names=["widowx-pick"]) == 4
+    assert publish([folder], target, methods=["vap", "generic"]) == 4
     table = pq.read_table(target)
     assert set(table["method"].to_pylist()) == {"generic", "vap"}
     (note,) = json.loads(table.schema.metadata[b"runs"])
@@ -231,6 +170,4 @@ def test_of_a_run_only_the_methods_and_suites_that_are_named_are_taken(tmp_path:
     assert [len(episodes) for _, episodes in read_runs(whole)] == [4, 2]
     with pytest.raises(BadOutput, match="lack tap; they have generic, soft, vap"):
         publish([folder], tmp_path / "t.parquet", methods=["vap", "tap"])
-    with pytest.raises(BadOutput, match="hold no run of franka-pick"):
-        publish([folder], tmp_path / "t.parquet", suite_names=["franka-pick"])
     assert not (tmp_path / "t.parquet").exists()

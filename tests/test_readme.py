@@ -10,7 +10,7 @@ from tests.published import RESULTS, episodes_of, in_percent, method_of, of_way,
 from vap_core.policies.protocol import checkpoint_of
 from vap_core.study.failures import breakdown, list_failures
 from vap_core.study.results import load_runs, results
-from vap_core.study.stats import ALL_TASKS, Rate
+from vap_core.study.stats import ALL_TASKS, Estimate
 from vap_core.study.trials import shipped
 
 LIMITS = {"README.md": 1100, "CHANGELOG.md": 1500, "docs": 12_000}
@@ -47,7 +47,7 @@ def test_success_rates() -> None:
     held = {}
     for line in whole.itertuples():
         track = ", ".join(filter(None, (line.suite, line.split, f"n = {line.n} of {line.listed}")))
-        held[line.method, track] = in_percent(Rate(0, line.n, line.sr, line.sr_low, line.sr_high))
+        held[line.method, track] = in_percent(Estimate(line.sr, line.sr_low, line.sr_high, line.n))
     assert quoted == held
     vap = whole[(whole.method == "vap") & (whole.suite == "simpler-fractal")]
     over = [
@@ -87,7 +87,7 @@ def test_what_the_true_mask_at_every_step_reaches() -> None:
     cells = []
     for line in found[found.task == ALL_TASKS].itertuples():
         assert (line.n, line.errors) == (line.listed, 0)
-        cells.append(in_percent(Rate(0, line.n, line.sr, line.sr_low, line.sr_high)))
+        cells.append(in_percent(Estimate(line.sr, line.sr_low, line.sr_high, line.n)))
     matching, variants, bridge, vlabench, tabletop = cells
     assert (
         f"simpler-fractal {matching} and {variants}, simpler-bridge {bridge}, "

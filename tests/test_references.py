@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from tests.toys import MeanColour, SameColour, detector, scene, segmenter
-from vap_core.analysis import drag_box, dragged_box
 from vap_core.base import media
 from vap_core.base.errors import BadPhoto
 from vap_core.base.media import load_photo
 from vap_core.base.types import Boxes
 from vap_core.memory import remember
+from vap_core.notebook import drag_box, dragged_box
 from vap_core.perception.protocols import Stack
 from vap_core.perception.references import choose_references, whole_photos
 from vap_core.study import register as registering

@@ -18,12 +18,13 @@ from scipy.stats import binomtest
 
 from tests.command import vap
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import DATA, markdown
+from vap_core.base.files import DATA
 from vap_core.simulation import suites
 from vap_core.study.report import conclude, report
 from vap_core.study.results import errors, load_runs, outcomes, publish, results
 from vap_core.study.stats import ALL_TASKS, compare, rate, rate_over_layouts
 from vap_core.study.store import append, open_run
+from vap_core.study.table import printed
 from vap_core.study.trials import Study
 
 BRIDGE = (("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera"))
@@ -183,7 +184,11 @@ def test_a_suite_without_a_list_has_what_each_method_was_asked_for(tmp_path: Pat
 
 
 def test_a_bar_in_a_cell_stays_in_its_cell() -> None:
-    assert markdown([["a"], ["x|y"]]).splitlines() == ["| a    |", "|------|", r"| x\|y |"]
+    assert printed([["a"], ["x|y"]], "markdown").splitlines() == [
+        "| a    |",
+        "|------|",
+        r"| x\|y |",
+    ]
 
 
 def test_a_published_table_is_reported_like_its_runs(tmp_path: Path) -> None:
@@ -262,7 +267,7 @@ def test_seeds_of_a_benchmark_are_one_report_with_layouts_for_units(tmp_path: Pa
     shaver = lines.loc[("pick-shaver", "vap")]
     assert (shaver.n, shaver.listed, shaver.seeds, shaver.layouts) == (18, 72, 3, 6)
     assert shaver.sr_layout_low < shaver.sr_low, "Wilson's 18 independent episodes claim too much"
-    (c,) = (c for c in compare(runs.table, runs.methods) if c.task == "pick-shaver")
+    (c,) = (c for c in compare(runs.table, runs.methods).itertuples() if c.task == "pick-shaver")
     assert (c.pairs, c.layouts) == (18, 6)
     once = results(load_runs([tmp_path / "0"])).set_index(["task", "method"]).loc["pick-shaver"]
     assert once["sr_layout_low"].isna().all(), "no layout returns: Wilson alone"

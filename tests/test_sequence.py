@@ -19,7 +19,7 @@ from vap_core.simulation.suites import lists
 from vap_core.simulation.suites.open_row import build_scene, open_row
 from vap_core.simulation.types import Outcome, of_subgoals
 from vap_core.study import diagnosis
-from vap_core.study.failures import breakdown, breakdown_rows
+from vap_core.study.failures import breakdown, breakdown_table
 
 DONE = Outcome("success", True, True, 5, True, False, True, 30)
 MISSED = Outcome("failure", False, False, 0, False, True, False, 60)
@@ -234,7 +234,7 @@ def test_the_first_step_that_failed_is_diagnosed(episode):
     assert diagnosis.columns(done)["case"] == ""
     counts = breakdown(pd.DataFrame([row, {**done.summary(), **diagnosis.columns(done)}]))
     assert counts["sub-goal 2"].tolist() == [1]
-    assert "sub-goal 2 % of failures" in breakdown_rows(counts)[0]
+    assert "sub-goal 2 % of failures" in breakdown_table(counts)
 
 
 def test_an_error_after_a_step_that_failed_is_no_failure(episode):

@@ -2,6 +2,7 @@
 
 import math
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from statsmodels.stats.multitest import multipletests
 from vap_core.simulation import suites
 from vap_core.study.stats import (
     ALL_TASKS,
-    Comparison,
+    COMPARED,
     bootstrap_interval,
     compare,
     detectable_effect_text,
@@ -136,12 +137,16 @@ def episodes(
 WON = {"generic": [1, 1, 0, 0, 0, 0, 0, 0, 0, 1], "vap": [1, 1, 1, 1, 1, 1, 1, 1, 0, 0]}
 
 
-def told(c: Comparison) -> tuple[object, ...]:
-    return tuple(getattr(c, name) for name in Comparison.__dataclass_fields__)
+def compared(*given: Any, **more: Any) -> list[Any]:
+    return list(compare(*given, **more).itertuples(index=False))
+
+
+def told(c: Any) -> tuple[object, ...]:
+    return tuple(getattr(c, name) for name in COMPARED)
 
 
 def test_a_pair_of_methods_is_counted_by_hand() -> None:
-    (c,) = compare(episodes(WON))
+    (c,) = compared(episodes(WON))
     assert (c.one, c.other, c.pairs, c.layouts, c.both, c.only_one, c.only_other, c.neither) == (
         "generic",
         "vap",
@@ -162,22 +167,22 @@ def test_an_error_is_no_success() -> None:
     table.loc[table.method.eq("vap") & table.episode.eq(0), "outcome"] = (
         "error"  # its success was already seen
     )
-    (c,) = compare(table)
+    (c,) = compared(table)
     assert (c.both, c.only_one, c.pairs) == (1, 2, 10)
 
 
 def test_what_one_method_did_not_run_is_no_pair() -> None:
     table = episodes(WON)
-    (c,) = compare(table[~(table.method.eq("vap") & (table.episode >= 7))])
+    (c,) = compared(table[~(table.method.eq("vap") & (table.episode >= 7))])
     assert (c.pairs, c.only_other, c.only_one) == (7, 5, 0)
-    assert compare(table[table.method == "vap"]) == []
+    assert compared(table[table.method == "vap"]) == []
     apart = table[(table.method == "vap") ^ (table.episode < 5)]
-    assert compare(apart) == []
+    assert compared(apart) == []
 
 
 def test_policies_are_never_mixed() -> None:
     assert (
-        compare(
+        compared(
             pd.concat(
                 [episodes({"generic": [1, 0]}), episodes({"vap": [1, 0]}).assign(policy="other")]
             )
@@ -191,21 +196,21 @@ def test_order_of_rows_and_names_of_methods_change_nothing() -> None:
         [episodes(WON), episodes({"generic": [0, 1, 0], "vap": [1, 0, 1]}, task="put-camera")],
         ignore_index=True,
     )
-    plain = [told(c) for c in compare(table, ["generic", "vap"])]
+    plain = [told(c) for c in compared(table, ["generic", "vap"])]
     shuffled = sorted(
-        told(c) for c in compare(table.sample(frac=1, random_state=3), ["generic", "vap"])
+        told(c) for c in compared(table.sample(frac=1, random_state=3), ["generic", "vap"])
     )
     assert shuffled == sorted(plain)
-    (whole,) = compare(table, ["generic", "vap"], by_task=False)
+    (whole,) = compared(table, ["generic", "vap"], by_task=False)
     assert told(whole) == plain[-1], "all tasks together, without the comparisons of each"
-    renamed = compare(table.replace({"vap": "zzz", "generic": "yyy"}), ["yyy", "zzz"])
+    renamed = compared(table.replace({"vap": "zzz", "generic": "yyy"}), ["yyy", "zzz"])
     assert [told(c)[6:] for c in renamed] == [line[6:] for line in plain]
 
 
 def test_turning_the_comparison_round_turns_its_sign() -> None:
     (c,), (back,) = (
-        compare(episodes(WON), ["generic", "vap"]),
-        compare(episodes(WON), ["vap", "generic"]),
+        compared(episodes(WON), ["generic", "vap"]),
+        compared(episodes(WON), ["vap", "generic"]),
     )
     assert (back.one, back.other, back.difference, back.p) == ("vap", "generic", -c.difference, c.p)
     assert (back.low, back.high) == (
@@ -217,8 +222,8 @@ def test_turning_the_comparison_round_turns_its_sign() -> None:
 def test_seeds_of_one_layout_are_one_cluster() -> None:
     one = episodes(WON)
     (once,), (ten,) = (
-        compare(one),
-        compare(pd.concat([one.assign(seed=seed) for seed in range(10)])),
+        compared(one),
+        compared(pd.concat([one.assign(seed=seed) for seed in range(10)])),
     )
     assert (ten.pairs, ten.layouts, ten.only_other) == (100, 10, 60)
     assert (ten.low, ten.high) == (pytest.approx(once.low), pytest.approx(once.high))
@@ -228,14 +233,14 @@ def test_seeds_of_one_layout_are_one_cluster() -> None:
 
 def test_a_warm_ups_seeds_are_other_layouts() -> None:
     one = episodes(WON, task="pick-cup", suite="widowx-pick")
-    (c,) = compare(pd.concat([one, one.assign(seed=1)]))
+    (c,) = compared(pd.concat([one, one.assign(seed=1)]))
     assert (c.pairs, c.layouts) == (20, 20)
 
 
 def test_holm_takes_single_tasks_and_all_of_them_apart() -> None:
     methods = {**WON, "mask-only": [0] * 10}
     table = pd.concat([episodes(methods), episodes(methods, task="put-camera")])
-    found = compare(table)
+    found = compared(table)
     single, whole = (
         [c for c in found if c.task != ALL_TASKS],
         [c for c in found if c.task == ALL_TASKS],
@@ -251,9 +256,9 @@ def test_holm_does_not_depend_on_what_else_a_table_holds() -> None:
     alone = episodes(methods)
     others = [episodes(methods, suite="vlabench"), episodes(methods).assign(policy="another")]
     by_itself, *beside = (
-        [c.p_holm for c in compare(pd.concat([alone, one]))[:3]] for one in (None, *others)
+        [c.p_holm for c in compared(pd.concat([alone, one]))[:3]] for one in (None, *others)
     )
-    assert min(by_itself) > min(c.p for c in compare(alone))
+    assert min(by_itself) > min(c.p for c in compared(alone))
     assert all(one == by_itself for one in beside)
 
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from vap_core.analysis.plots import keep_png
 from vap_core.base.errors import BadOutput
+from vap_core.notebook import keep_png
 from vap_core.study import failures
 from vap_core.study.trials import Study
 

@@ -1,13 +1,9 @@
-"""Curves of a survey, on tables made by hand: what they count, and that every figure draws what it was given."""
+"""Measures and curves of a survey, on tables made by hand: what they count."""
 
-from pathlib import Path
-
-import numpy as np
 import pandas as pd
 import pytest
 
-from vap_core.base.pictures import write_png
-from vap_core.study import charts
+from vap_core.study import survey
 from vap_core.study.perception import KS, OFF, RULES
 from vap_core.study.stats import rate
 from vap_core.study.survey import measures, report
@@ -117,18 +113,19 @@ def tables() -> dict[str, pd.DataFrame]:
 
 
 def test_measures_count_what_shows_the_target() -> None:
-    found = {m.name: m for m in measures(tables())}
+    table = measures(tables())
+    found = {line["measure"]: line for line in table.to_dict("records")}
     hard = found["right instance, hard"]
-    assert list(hard.cells) == ["simpler-bridge", "vlabench", "all"]
-    assert (hard.cells["all"].n, hard.cells["all"].value) == (9, pytest.approx(4 / 9))
-    assert (hard.cells["all"].low, hard.cells["all"].high) == (rate(4, 9).low, rate(4, 9).high)
-    assert hard.verdict == "short: simpler-bridge, vlabench"
-    assert found["right instance, standard"].verdict == "not measured"
-    assert found["mask IoU of the right instance"].verdict == "met"
-    assert found["track IoU, whole episodes"].cells["vlabench"].value == pytest.approx(0.75)
-    assert found["target proposed"].cells["all"].n == 9
-    assert found["false alarm, absent category"].cells["all"].n == 9
-    assert found["detection recall@10, IoU .5"].cells["all"].n == 9 + 12
+    assert list(table.columns[2:-1]) == ["simpler-bridge", "vlabench", "all"]
+    assert (hard["all"].n, hard["all"].value) == (9, pytest.approx(4 / 9))
+    assert (hard["all"].low, hard["all"].high) == (rate(4, 9).low, rate(4, 9).high)
+    assert hard["verdict"] == "short: simpler-bridge, vlabench"
+    assert found["right instance, standard"]["verdict"] == "not measured"
+    assert found["mask IoU of the right instance"]["verdict"] == "met"
+    assert found["track IoU, whole episodes"]["vlabench"].value == pytest.approx(0.75)
+    assert found["target proposed"]["all"].n == 9
+    assert found["false alarm, absent category"]["all"].n == 9
+    assert found["detection recall@10, IoU .5"]["all"].n == 9 + 12
 
 
 def test_the_report_tells_every_part() -> None:
@@ -150,44 +147,15 @@ def test_the_report_tells_every_part() -> None:
 
 
 def test_abstention_covers_more_and_more_and_never_a_view_without_candidates() -> None:
-    curve = charts.abstention(tables()["choices"], "cosine_margin")
+    curve = survey.abstention(tables()["choices"], "cosine_margin")
     assert curve.threshold.is_monotonic_decreasing
     assert curve.coverage.tolist() == pytest.approx([i / 9 for i in range(1, 9)])
     assert (curve.n.iloc[-1], curve.right.iloc[-1]) == (8, pytest.approx(4 / 8))
-    assert len(charts.abstention(tables()["choices"], "margin")) == 3
+    assert len(survey.abstention(tables()["choices"], "margin")) == 3
 
 
 def test_lookalike_pairs_match_a_look_alike_with_the_target_beside_it() -> None:
-    found = charts.lookalike_pairs(tables()["objects"])
+    found = survey.lookalike_pairs(tables()["objects"])
     assert len(found) == 9
     assert sorted(found.ahead.round(6).unique()) == [-0.1, 0.3]
     assert (found.ahead < 0).sum() == 1
-
-
-@pytest.mark.parametrize(
-    ("draw", "table", "axes"),
-    [(charts.abstention_figure, "choices", 1), (charts.hardness_figure, "objects", 2), (charts.references_figure, "choices", 3),
-     (charts.time_figure, "tracks", 1), (charts.hidden_figure, "tracks", 1)],
-)  # fmt: skip
-def test_figures_draw(draw, table: str, axes: int, tmp_path: Path) -> None:
-    figure = draw(tables()[table])
-    assert len(figure.axes) == axes
-    write_png(figure, tmp_path / "figure.png", dpi=40)
-    assert (tmp_path / "figure.png").stat().st_size > 2000
-
-
-def test_time_and_hidden_figures_show_the_numbers() -> None:
-    lines = charts.time_figure(tables()["tracks"]).axes[0].lines
-    assert [line.get_label() for line in lines[:2]] == [
-        "simpler-bridge, 4 tracks",
-        "vlabench, 8 tracks",
-    ]
-    assert lines[0].get_ydata()[1:].tolist() == [1.0, 0.5]
-    assert np.isnan(lines[0].get_ydata()[0])
-    lost = charts.hidden_figure(tables()["tracks"]).axes[0].containers[0].lines[0]
-    assert lost.get_ydata().tolist() == [50.0, 50.0]
-    tracks = tables()["tracks"]
-    arm = tracks[tracks.hidden > 0].assign(kind="arm").iloc[:3]
-    n = int(arm.target.sum())
-    axes = charts.hidden_figure(pd.concat([tracks, arm], ignore_index=True)).axes[0]
-    assert axes.get_legend_handles_labels()[1][1] == f"an arm moves in front (n = {n})"

@@ -15,17 +15,18 @@ from tests.command import vap
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study import survey, tracking
+from vap_core.study.measurement import read
 from vap_core.study.stats import (
     NONE,
     Estimate,
     average_precision,
-    mean,
+    mean_by,
     precision,
     rate,
     share,
     share_by,
 )
-from vap_core.study.survey import ALL, Measure, Survey, plan, publish, read
+from vap_core.study.survey import ALL, Survey, publish, verdict
 
 MARKS = st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=12)
 
@@ -113,15 +114,15 @@ def test_rows_that_repeat_their_episode_do_not_narrow_its_share() -> None:
 def test_mean_is_bootstrapped_by_episode_not_by_view() -> None:
     values = np.random.default_rng(3).normal(size=30)
     apart, thrice = (
-        mean(frame([*range(30)], list(values)), "x"),
-        mean(frame([*range(30)] * 3, [*values] * 3), "x"),
+        mean_by(frame([*range(30)], list(values)), "x"),
+        mean_by(frame([*range(30)] * 3, [*values] * 3), "x"),
     )
     assert apart.value == pytest.approx(values.mean()) == pytest.approx(thrice.value)
     assert (apart.low, apart.high) == (pytest.approx(thrice.low), pytest.approx(thrice.high))
     error = values.std() / np.sqrt(30)
     assert apart.high - apart.low == pytest.approx(2 * 1.96 * error, rel=0.15)
-    assert mean(frame([0, 1], [None, 2.0]), "x").n == 1
-    assert mean(frame([0], [None]), "x") is NONE
+    assert mean_by(frame([0, 1], [None, 2.0]), "x").n == 1
+    assert mean_by(frame([0], [None]), "x") is NONE
 
 
 def test_precision_is_the_mean_over_tasks() -> None:
@@ -145,15 +146,17 @@ def test_a_measure_names_the_suites_that_miss_its_target() -> None:
         "none": NONE,
         ALL: Estimate(0.965, 0.9, 1.0, 100),
     }
-    assert Measure("m", 0.97, cells).verdict == "short: two"
-    assert Measure("m", 0.96, cells).verdict == "met"
-    assert Measure("m", 0.5, {"none": NONE}).verdict == "not measured"
-    assert Measure("m", None, cells).verdict == ""
+    assert verdict(0.97, cells) == "short: two"
+    assert verdict(0.96, cells) == "met"
+    assert verdict(0.5, {"none": NONE}) == "not measured"
+    assert verdict(None, cells) == ""
 
 
 def test_the_plan_is_the_same_every_time_and_every_part_has_its_own_name() -> None:
-    jobs = plan(Survey())
-    assert [job.name for job in jobs] == [job.name for job in plan(Survey())]
+    jobs = [job for job in Survey().jobs() if job.what is not None]
+    assert [job.name for job in jobs] == [
+        job.name for job in Survey().jobs() if job.what is not None
+    ]
     assert len({job.name for job in jobs}) == len(jobs)
     opened = [row.key for job in jobs if not isinstance(job.what, tracking.Job) for row in job.what]
     wanted = sum(n * len(BENCHMARKS[suite].tasks) for suite, n in survey.EPISODES.items())
@@ -173,17 +176,14 @@ def test_unknown_names_are_refused() -> None:
 
 
 def test_a_folder_that_is_no_finished_survey_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadOutput, match=r"run\.json is absent"):
-        read(tmp_path)
-    survey.store.open_run(tmp_path / "begun", Survey(suites=("simpler-bridge",)).configuration())
-    with pytest.raises(BadOutput, match="lacks views, .* run the same measure perception again"):
-        publish(tmp_path / "begun", tmp_path)
+    with pytest.raises(BadOutput, match=r"lacks views\.parquet, .*; run the same"):
+        publish(tmp_path, tmp_path / "kept")
 
 
 @pytest.mark.sweep
 def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    small = ["--quick", "--suite", "simpler-fractal", "--episodes", "1", "--workers", "1"]
+    small = ["--quick", "--suite", "simpler-fractal", "--workers", "1"]
     words = [
         "measure",
         "perception",
@@ -204,7 +204,7 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
         "left out: simpler-fractal 0 of 2",
     ):
         assert told in done.stdout
-    tables = read(out)
+    tables = read(out, Survey.caller, survey.TABLES)
     assert len(tables["views"]) == 2
     assert len(tables["choices"]) == 2 * 4 * 2
     assert set(tables["tracks"].hidden) == {0, 3}
@@ -232,14 +232,14 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
         part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
     }
     lost.unlink()
-    asked = Survey(suites=("simpler-fractal",), episodes=1, quick=True)
-    again = survey.run_survey(asked, out, jobs=1, progress=False)
+    asked = Survey(suites=("simpler-fractal",), quick=True)
+    again = survey.run_survey(asked, out, workers=1, progress=False)
     assert {
         part.name: part.stat().st_mtime_ns for part in (out / "parts").iterdir() if part != lost
     } == kept
     assert all(tables[name].equals(again[name]) for name in survey.TABLES)
     lost.write_text("{")
     with pytest.raises(BadOutput, match="is damaged; delete it and run the same command again"):
-        survey.run_survey(asked, out, jobs=1, progress=False)
+        survey.run_survey(asked, out, workers=1, progress=False)
     with pytest.raises(BadOutput, match="holds another run"):
-        survey.run_survey(replace(asked, suites=("tabletop",)), out, jobs=1, progress=False)
+        survey.run_survey(replace(asked, suites=("tabletop",)), out, workers=1, progress=False)

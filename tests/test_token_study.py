@@ -1,7 +1,6 @@
 """Tokens learned and measured: the rotation into a policy's space, methods that use it, and the study with its tables."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy import stats
 from scipy.stats import ortho_group
 from typer.testing import CliRunner
 
-from tests.full_disk import full_disk
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
@@ -24,8 +22,9 @@ from vap_core.policies.tables import open_table
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.study import engine, tokens, trials
+from vap_core.study.measurement import measure
 from vap_core.study.stats import rate
-from vap_core.study.tokens import OTHER, Job, Scene, Tokens, plan
+from vap_core.study.tokens import OTHER, Job, Scene, Tokens
 from vap_core.study.trials import Study
 
 from .test_soft_prompt import SUITE, TASK, grown  # noqa: F401
@@ -54,10 +53,6 @@ def tiny(
     def training(epochs: int = 2) -> TokenTraining:
         return TokenTraining(epochs=epochs, augmentations=1)
 
-    def in_this_process(work: object, jobs: list[Job], workers: int, remedy: str) -> Iterator:
-        for job in jobs:
-            yield job, work(job)
-
     def scenes(suite: str, task: str) -> tuple[Scene, ...]:
         """Two episodes of noise in place of rendered views."""
         rows = suites.rows(suite, task)
@@ -70,7 +65,6 @@ def tiny(
         return tuple(Scene(episode=i, target=target, crops=crops) for i in range(2))
 
     monkeypatch.setattr(tokens, "TokenTraining", training)
-    monkeypatch.setattr(tokens, "results", in_this_process)
     monkeypatch.setattr(tokens, "scenes", scenes)
     for cached in (tokens._model, tokens._policy_model, tokens._negatives):
         cached.cache_clear()
@@ -140,9 +134,10 @@ def test_tokens_of_other_spaces_are_methods(
 def test_the_study_measures_every_token_and_goes_on(
     tiny: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tokens, "plan", lambda asked: plan(asked)[:2])
+    jobs = Tokens.jobs
+    monkeypatch.setattr(Tokens, "jobs", lambda asked: jobs(asked)[:2])
     asked = Tokens((SUITE,), (5,), epochs=2)
-    tables = tokens.run(asked, tmp_path / "run", progress=False)
+    tables = measure(asked, tmp_path / "run", progress=False)
     answers = tables["answers"]
     assert set(answers.groupby(["learned_in", "token", "read_by"]).groups) == set(
         tokens.READINGS.values()
@@ -167,18 +162,18 @@ def test_the_study_measures_every_token_and_goes_on(
     *_, (_, method) = learned_token.lessons(load_vlm(tiny[0]), rows[0].target, taught, training)
     assert np.allclose(learned["vlm"], method, atol=1e-5)
 
-    def must_not_run(job: Job) -> None:
+    def must_not_run(asked: Tokens, job: Job, folder: Path) -> None:
         raise AssertionError(job)
 
-    run_job = tokens.run_job
-    monkeypatch.setattr(tokens, "run_job", must_not_run)
-    again = tokens.run(asked, tmp_path / "run", progress=False)
+    run_job = Tokens.run
+    monkeypatch.setattr(Tokens, "run", must_not_run)
+    again = measure(asked, tmp_path / "run", progress=False)
     assert again["answers"].equals(answers)
-    monkeypatch.setattr(tokens, "run_job", run_job)
-    next((tmp_path / "run" / "answers").glob("*.parquet")).unlink()
-    mended = tokens.run(asked, tmp_path / "run", progress=False)
+    monkeypatch.setattr(Tokens, "run", run_job)
+    next((tmp_path / "run" / "parts").glob("*.json")).unlink()
+    mended = measure(asked, tmp_path / "run", progress=False)
     assert mended["answers"].equals(answers), "a part that was deleted is made again"
-    other = tokens.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
+    other = measure(Tokens((SUITE,), (5,), epochs=1), tmp_path / "other", progress=False)
     for _ in range(2):
         for path in tokens.publish(tmp_path / "run", tmp_path / "kept"):
             assert len(pd.read_parquet(path)) == len(tables[path.stem.removeprefix("token_")])
@@ -188,47 +183,18 @@ def test_the_study_measures_every_token_and_goes_on(
         runs = json.loads(pq.read_schema(path).metadata[b"runs"])
         assert [run["configuration"]["epochs"] for run in runs] == [2, 1]
     with pytest.raises(BadOutput):
-        tokens.run(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
+        measure(Tokens((SUITE,), (5,), epochs=1), tmp_path / "run", progress=False)
     assert "learned in the policy" in tokens.report(tables)
     assert "the model chooses the target" in tokens.report(tables)
 
 
-def test_a_job_whose_parts_are_not_named_is_not_done(tmp_path: Path) -> None:
-    """A disk that was full left an empty file."""
-    (job, *_) = plan(Tokens((SUITE,), (5,), epochs=2))
-    done = tmp_path / "done" / job.name
-    done.parent.mkdir()
-    done.write_text("")
-    assert not tokens._is_done(tmp_path, job)
-    (tmp_path / "part").touch()
-    done.write_text("part\n")
-    assert tokens._is_done(tmp_path, job)
-
-
-def test_a_disk_that_is_full_ends_the_study_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    jobs = plan(Tokens((SUITE,), (5,), epochs=2))[:1]
-    monkeypatch.setattr(tokens, "plan", lambda asked: jobs)
-    monkeypatch.setattr(Tokens, "configuration", lambda asked: {"survey": "tokens"})
-    tokens.store.open_run(tmp_path / "run", {"survey": "tokens"})
-    (tmp_path / "run" / "done").mkdir()
-    monkeypatch.setattr(tokens, "results", lambda *_, **__: [(jobs[0], {"answers": [{"n": 1}]})])
-    monkeypatch.setattr(
-        tokens.store, "write_part", lambda folder, *_, **__: folder / "answers" / "part"
-    )
-    with pytest.raises(BadOutput, match="^measure tokens: .* cannot be written"), full_disk():
-        tokens.run(Tokens((SUITE,), (5,), epochs=2), tmp_path / "run", progress=False)
-    assert not list((tmp_path / "run" / "done").iterdir())
-
-
 def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None:
-    jobs = plan(Tokens((SUITE,), (1, 5), epochs=1))
+    jobs = Tokens((SUITE,), (1, 5), epochs=1).jobs()
     assert [(job.k, job.where) for job in jobs[:2]] == [(5, "vlm"), (5, "policy")]
     assert len(jobs) == 4 * 3
-    assert {job.where for job in plan(Tokens((SUITE,), places=("vlm",)))} == {"vlm"}
+    assert {job.where for job in Tokens((SUITE,), places=("vlm",)).jobs()} == {"vlm"}
     with pytest.raises(BadStudy, match="from 5 photos alone"):
-        tokens.run(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
+        measure(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
     with pytest.raises(UnknownName, match="measure tokens: --learn-in"):
         Tokens((SUITE,), places=("here",))
     with pytest.raises(UnknownName, match="measure tokens: suite"):
@@ -260,8 +226,8 @@ def test_rates_are_counted_by_hand() -> None:
     assert (both["right"].n, both["right"].value) == (2, pytest.approx(np.mean(rights)))
     assert (both["right"].low, both["right"].high) == (max(0, interval[0]), min(1, interval[1]))
     (taken,) = tokens.confusions(answers).to_dict("records")
-    assert (taken["look-alike"], taken["yes"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
-    curve = tokens.curve(answers).set_index(["step", "kind"]).yes
+    assert (taken["look-alike"], taken["value"], taken["n"]) == ("cup-lookalike-1", 0.25, 4)
+    curve = tokens.curve(answers).set_index(["step", "kind"]).value
     assert (curve[0, "own"], curve[9, "own"]) == (0, 0.75)
 
 

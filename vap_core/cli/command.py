@@ -65,6 +65,13 @@ def takes[T](cls: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None
     return wrap
 
 
+def made[T](cls: type[T], asked: Any, **more: Any) -> T:
+    """A value of which the fields are options of the same names; lists become tuples."""
+    given = {f.name: getattr(asked, f.name) for f in fields(cls) if hasattr(asked, f.name)}  # type: ignore[arg-type]
+    given |= more
+    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+
+
 def names(text: str) -> list[str]:
     """The names in "a, b,c", each once; empty ones are left out."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

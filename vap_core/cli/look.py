@@ -289,7 +289,7 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for report.md, CSV and LaTeX tables and pictures. Default RUN/report; of "
+            help="Folder for report.md, report.html, tables and pictures. Default RUN/report; of "
             "a table data/runs/TABLE-report."
         ),
     ] = None,
@@ -319,7 +319,7 @@ def report(
 
     folder = out or _report_folder(runs[0])
     print(conclude(runs, folder))
-    print(f"\nwrote {folder}: report.md, report.html, tables as CSV and LaTeX, pictures")
+    print(f"\nwrote {folder}: report.md, report.html, tables as CSV, pictures")
 
 
 @app.command()
@@ -332,16 +332,6 @@ def publish(
         Path, typer.Option(help="The table to write, for example data/results/mine.parquet.")
     ],
     replace: Replace = False,
-    supersede: Annotated[
-        bool,
-        typer.Option(
-            "--supersede",
-            help="Where a later source has read a method again, leave the earlier rows out.",
-        ),
-    ] = False,
-    suite: Annotated[
-        list[str] | None, typer.Option(help="Take the runs of this suite alone; repeatable.")
-    ] = None,
     methods: Annotated[
         str,
         typer.Option(
@@ -356,21 +346,12 @@ def publish(
         --to data/results/bounds.parquet --replace
     Example: python -m vap_core publish data/results/mine.parquet data/runs/more
         --to data/results/mine.parquet --replace
-    Example: python -m vap_core publish data/results/mine.parquet data/runs/vap-again
-        --to data/results/mine.parquet --replace --supersede
-    Example: python -m vap_core publish data/results/mine.parquet --suite simpler-bridge
-        --methods generic,vap --to data/results/bridge.parquet
+    Example: python -m vap_core publish data/runs/bridge --methods generic,vap
+        --to data/results/bridge.parquet
     """
     from vap_core.study.results import publish as write_table
 
-    n_episodes = write_table(
-        runs,
-        to,
-        replace=replace,
-        supersede=supersede,
-        suite_names=suite or (),
-        methods=names(methods),
-    )
+    n_episodes = write_table(runs, to, replace=replace, methods=names(methods))
     print(f"wrote {to}: {n_episodes} episodes")
 
 

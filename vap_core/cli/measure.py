@@ -1,20 +1,21 @@
 """The group measure: one part of the method or of a policy at a time."""
 
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from vap_core.cli.command import (
     Publish,
-    RandomSeed,
     RunFolder,
     RunFolderOr,
     StackName,
     Suites,
     Workers,
+    made,
     names,
+    takes,
 )
 
 app = typer.Typer(
@@ -24,26 +25,32 @@ app = typer.Typer(
 )
 
 
-@app.command("perception")
-def eval_perception(
-    stack: StackName = "embedded",
-    suite: Suites = None,
-    episodes: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Opening frames per task, as episodes spread evenly over its list."
-        ),
-    ] = None,
-    workers: Workers = 2,
-    out: RunFolder = Path("data/runs/perception"),
+def _print(text: str, written: Any = ()) -> None:
+    print(text)
+    if written:
+        print(f"wrote {', '.join(map(str, written))}")
+
+
+@dataclass(frozen=True)
+class OfPerception:
+    """The options of measure perception."""
+
+    stack: StackName = "embedded"
+    suite: Suites = None
+    workers: Workers = 2
+    out: RunFolder = Path("data/runs/perception")
     quick: Annotated[
         bool,
         typer.Option(
             "--quick", help="Two opening frames per task and one tracked episode per suite."
         ),
-    ] = False,
-    publish: Publish = None,
-) -> None:
+    ] = False
+    publish: Publish = None
+
+
+@app.command("perception")
+@takes(OfPerception)
+def eval_perception(asked: OfPerception) -> None:
     """Measure perception against the simulator: opening frames, tracks through whole expert
     episodes, and time. Interrupted, it goes on.
 
@@ -52,22 +59,20 @@ def eval_perception(
     from vap_core.perception.foundation.weights import check_present
     from vap_core.perception.stacks import check_stack
     from vap_core.simulation.suites import BENCHMARKS
-    from vap_core.study.survey import Survey, conclude, run_survey
-    from vap_core.study.survey import publish as write_tables
+    from vap_core.study.survey import Survey, conclude, publish, run_survey
 
-    check_stack(stack)
-    check_present(stack)
-    suite_names = tuple(dict.fromkeys(suite or BENCHMARKS))
-    survey = Survey(stack, suite_names, episodes, quick)
-    tables = run_survey(survey, out, jobs=workers)
-    print(conclude(tables, survey.stack, out))
-    if publish is not None:
-        written = ", ".join(map(str, write_tables(out, publish)))
-        print(f"wrote {written}")
+    check_stack(asked.stack)
+    check_present(asked.stack)
+    survey = made(Survey, asked, suites=tuple(dict.fromkeys(asked.suite or BENCHMARKS)))
+    tables = run_survey(survey, asked.out, workers=asked.workers)
+    text = conclude(tables, survey.stack, asked.out)
+    _print(text, asked.publish and publish(asked.out, asked.publish))
 
 
-@app.command("photos")
-def eval_photos(
+@dataclass(frozen=True)
+class OfPhotos:
+    """The options of measure photos."""
+
     folder: Annotated[
         Path,
         typer.Argument(
@@ -77,8 +82,8 @@ def eval_photos(
             "OBJECT/FILE) and objects.csv with object,category (else an object's name is its "
             "kind), masks/SCENE/OBJECT.png. Pixels of the upright photo, far corner exclusive.",
         ),
-    ],
-    stack: StackName = "embedded",
+    ]
+    stack: StackName = "embedded"
     clips: Annotated[
         bool,
         typer.Option(
@@ -86,9 +91,13 @@ def eval_photos(
             help="Follow objects through clips, too: a window pans from each scene to a copy of "
             "it and back, with every object twice.",
         ),
-    ] = False,
-    out: RunFolderOr = None,
-) -> None:
+    ] = False
+    out: RunFolderOr = None
+
+
+@app.command("photos")
+@takes(OfPhotos)
+def eval_photos(asked: OfPhotos) -> None:
     """Measure registering, grounding and the vote on photos of your own, against the boxes that you
     give. Interrupted, it goes on.
 
@@ -97,51 +106,52 @@ def eval_photos(
     """
     from vap_core.study.photos import measure_photos
 
-    folder_of_run = out or Path(f"data/runs/photos-{folder.resolve().name}")
-    print(measure_photos(folder, folder_of_run, stack, clips=clips))
+    out = asked.out or Path(f"data/runs/photos-{asked.folder.resolve().name}")
+    print(measure_photos(asked.folder, out, asked.stack, clips=asked.clips))
 
 
-@app.command("objects")
-def eval_objects(
+@dataclass(frozen=True)
+class OfObjects:
+    """The options of measure objects."""
+
     folder: Annotated[
         Path,
         typer.Argument(
             help="Objects that `objects import --out` made; or 3-D files with objects.csv: a line "
             "file,category,height_cm,groups each, the last two may be empty.",
         ),
-    ],
+    ]
     suite: Annotated[
         list[str] | None,
         typer.Option(help="A suite; repeatable. Each object takes its tasks of the same category."),
-    ] = None,
+    ] = None
     episodes: Annotated[
         int, typer.Option(min=1, help="Episodes per object and task, spread over its list.")
-    ] = 4,
+    ] = 4
     policy: Annotated[
         str, typer.Option(help="Default mini-pi0 where one ships for the suite, else scripted.")
-    ] = "",
+    ] = ""
     views_only: Annotated[
         bool, typer.Option("--views-only", help="Look at the opening views, and run no episodes.")
-    ] = False,
-    stack: StackName = "embedded",
-    out: RunFolderOr = None,
-) -> None:
+    ] = False
+    stack: StackName = "embedded"
+    out: RunFolderOr = None
+
+
+@app.command("objects")
+@takes(OfObjects)
+def eval_objects(asked: OfObjects) -> None:
     """Measure objects of your own in a suite's scenes, each in the target's place among its
     look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
     goes on.
 
     Example: python -m vap_core measure objects data/scans
     """
-    from vap_core.study.objects import ObjectSurvey, measure_objects
+    from vap_core.study.objects import ObjectMeasurement, measure_objects
 
-    asked = ObjectSurvey(
-        suites=tuple(dict.fromkeys(suite or ["tabletop"])),
-        episodes=episodes,
-        stack=stack,
-        policy=policy,
-        views_only=views_only,
-    )
-    print(measure_objects(folder, out or Path(f"data/runs/objects-{folder.resolve().name}"), asked))
+    suites = tuple(dict.fromkeys(asked.suite or ["tabletop"]))
+    out = asked.out or Path(f"data/runs/objects-{asked.folder.resolve().name}")
+    print(measure_objects(made(ObjectMeasurement, asked, suites=suites), out))
 
 
 @app.command("calibration")
@@ -197,65 +207,47 @@ def calibrate(
         print(f"wrote {keep_choice(stack, chosen)}")
 
 
-@app.command("parsers")
-def eval_parsers(
+@dataclass(frozen=True)
+class OfParsers:
+    """The options of measure parsers."""
+
     parser: Annotated[
         str,
         typer.Option(
             help="Parsers, with commas: rule, embedding, chat, or addresses of endpoints."
         ),
-    ] = "rule,embedding",
-    suite: Annotated[str, typer.Option(help="Only these suites, with commas. Default: all.")] = "",
+    ] = "rule,embedding"
+    suite: Annotated[str, typer.Option(help="Only these suites, with commas. Default: all.")] = ""
     part: Annotated[
         str,
         typer.Option(
             help="Only these parts, with commas: tune, check-1 to check-4, and the held-out test. "
             "Default: all."
         ),
-    ] = "",
+    ] = ""
     limit: Annotated[
         int | None,
         typer.Option(min=1, help="So many paraphrases of every suite and part. Default: all."),
-    ] = None,
-    wrong: Annotated[
-        bool, typer.Option("--wrong", help="List the paraphrases that are parsed wrongly, too.")
-    ] = False,
-    publish: Publish = None,
-) -> None:
+    ] = None
+    publish: Publish = None
+
+
+@app.command("parsers")
+@takes(OfParsers)
+def eval_parsers(asked: OfParsers) -> None:
     """Parse over 200 paraphrased instructions a suite, and print how often the object is right.
 
     Example: python -m vap_core measure parsers
     Example: python -m vap_core measure parsers --parser chat --part test --limit 20
     """
-    from vap_core.base.errors import BadStudy, one_of
-    from vap_core.instruction.parsers import load_parser
-    from vap_core.study import parsers
-    from vap_core.study.parsers import PARTS, answer_table, measure, suite_names
+    import pandas as pd
 
-    asked = names(parser)
-    if not asked:
-        raise BadStudy(
-            f"measure parsers: --parser {parser!r} names no parser; name one, or leave the option "
-            "out for the default, rule,embedding."
-        )
-    suites = names(suite) or list(suite_names())
-    parts = names(part) or list(PARTS)
-    for what, given, known in (("suite", suites, suite_names()), ("part", parts, PARTS)):
-        for name in given:
-            if name not in known:
-                raise one_of(f"measure parsers: {what}", name, known)
-    answers = []
-    for name in asked:
-        answers += measure(name, partial(load_parser, name), suites, parts, limit)
-    table = answer_table(answers)
-    if wrong:
-        for answer in answers:
-            if not answer.right:
-                found = answer.found or answer.error or "nothing"
-                print(f"{answer.parser}: {answer.text!r} means {answer.meant or 'none'}: {found}")
-    print(parsers.text(table))
-    if publish is not None:
-        print(f"wrote {', '.join(map(str, parsers.publish(table, publish)))}")
+    from vap_core.study.parsers import PARTS, ParserMeasurement, publish, text
+
+    given = {"parsers": names(asked.parser), "suites": names(asked.suite)}
+    measurement = made(ParserMeasurement, asked, **given, parts=names(asked.part) or PARTS)
+    table = pd.DataFrame(measurement.rows())
+    _print(text(table), asked.publish and publish(table, asked.publish))
 
 
 @app.command("policy")
@@ -275,15 +267,6 @@ def eval_policy(
             "tinted-magenta, tinted-0.3 or tinted-yellow-0.7 force the colour and the opacity."
         ),
     ] = "tinted,painted,described,plain",
-    execute: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Actions of each chunk to carry out before the policy is asked again. Default as "
-            "the checkpoint says.",
-        ),
-    ] = None,
-    seed: RandomSeed = 0,
     workers: Workers = 2,
     out: Annotated[
         Path | None,
@@ -297,7 +280,6 @@ def eval_policy(
     paint, by words, or not at all.
 
     Example: python -m vap_core measure policy --suite simpler-bridge --scenes 4
-    Example: python -m vap_core measure policy --suite tabletop --ways tinted --execute 10
     Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,tinted-magenta
     """
     from vap_core.base.errors import BadStudy
@@ -320,8 +302,6 @@ def eval_policy(
         suite,
         scenes=scenes,
         ways=names(ways),
-        execute=execute,
-        seed=seed,
         workers=workers,
     )
     print(conclude(table))
@@ -330,24 +310,26 @@ def eval_policy(
         print(f"wrote {out}")
 
 
-@app.command("tokens")
-def eval_tokens(
-    suite: Suites = None,
-    k: Annotated[
-        str, typer.Option("--k", help="Numbers of photos to learn from, with commas.")
-    ] = "1,3,5,7",
+@dataclass(frozen=True)
+class OfTokens:
+    """The options of measure tokens."""
+
+    suite: Suites = None
+    k: Annotated[str, typer.Option("--k", help="Numbers of photos to learn from, with commas.")] = (
+        "1,3,5,7"
+    )
     epochs: Annotated[
         int,
         typer.Option(min=1, help="Passes over the augmented photos; the soft prompt's own is 20."),
-    ] = 20,
-    learn_in: Annotated[
-        str,
-        typer.Option(help="vlm, policy or both: whose weights a token is learned in."),
-    ] = "vlm,policy",
-    workers: Workers = 1,
-    out: RunFolder = Path("data/runs/tokens"),
-    publish: Publish = None,
-) -> None:
+    ] = 20
+    workers: Workers = 1
+    out: RunFolder = Path("data/runs/tokens")
+    publish: Publish = None
+
+
+@app.command("tokens")
+@takes(OfTokens)
+def eval_tokens(asked: OfTokens) -> None:
     """Learn the token of every personal object from few and from many photos, in the
     vision-language model and in the policies; measure what it recognizes, and which object of
     listed episodes the model chooses by it. Interrupted, it goes on; about a minute and a half a
@@ -358,17 +340,15 @@ def eval_tokens(
     """
     from vap_core.base.errors import BadStudy
     from vap_core.simulation.suites import BENCHMARKS
-    from vap_core.study.tokens import Tokens, report, run
-    from vap_core.study.tokens import publish as write_tables
+    from vap_core.study.measurement import measure
+    from vap_core.study.tokens import Tokens, publish, report
 
-    ks = tuple(int(number) for number in names(k) if number.isdecimal() and int(number))
-    if len(ks) != len(names(k)) or not ks:
-        raise BadStudy(f"measure tokens: --k {k}: give numbers of photos, such as 1,3,5,7.")
-    asked = Tokens(tuple(dict.fromkeys(suite or BENCHMARKS)), ks, epochs, tuple(names(learn_in)))
-    print(report(run(asked, out, workers=workers)))
-    if publish is not None:
-        written = ", ".join(map(str, write_tables(out, publish)))
-        print(f"wrote {written}")
+    ks = [int(number) for number in names(asked.k) if number.isdecimal() and int(number)]
+    if len(ks) != len(names(asked.k)) or not ks:
+        raise BadStudy(f"measure tokens: --k {asked.k}: give numbers of photos, such as 1,3,5,7.")
+    suites = tuple(dict.fromkeys(asked.suite or BENCHMARKS))
+    tables = measure(made(Tokens, asked, suites=suites, ks=ks), asked.out, workers=asked.workers)
+    _print(report(tables), asked.publish and publish(asked.out, asked.publish))
 
 
 @app.command("embeddings")
@@ -404,9 +384,9 @@ def embeddings(
     Example: python -m vap_core measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
 
-    from vap_core.analysis.embeddings import check_output, keep, report, spaces
     from vap_core.base.errors import BadPolicy
     from vap_core.simulation.suites import BENCHMARKS
+    from vap_core.study.embeddings import check_output, keep, report, spaces
     from vap_core.study.trials import shipped
 
     folders = list(policies or ())

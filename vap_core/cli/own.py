@@ -198,18 +198,19 @@ def ground(
     Example: python -m vap_core ground desk.jpg "bring the one I used last" --parser embedding
         --speaker anna
     """
-    from vap_core.analysis.ground import (
-        GROUND_SIDE,
-        ground_image,
-        parse_boxes,
-        to_json,
-        write_evidence,
-    )
-    from vap_core.analysis.ground_clip import ground_clip, is_clip
     from vap_core.base.errors import BadInstruction, command
     from vap_core.base.media import load_photo, shrink
     from vap_core.instruction.parsers import Parsing
     from vap_core.perception.boxes import SMALL_MEGAPIXELS
+    from vap_core.study.grounding import (
+        GROUND_SIDE,
+        ground_clip,
+        ground_image,
+        is_clip,
+        parse_boxes,
+        to_json,
+        write_evidence,
+    )
 
     parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
     if is_clip(image):
@@ -288,7 +289,7 @@ def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
 
 def _print_notes(stack: str, warnings: Sequence[str], always_tint: bool) -> None:
     """What `ground` says beside its answer."""
-    from vap_core.analysis.ground import missing_threshold
+    from vap_core.study.grounding import missing_threshold
 
     missing = "" if always_tint else missing_threshold(stack)
     for line in filter(None, (missing, *warnings)):
@@ -524,8 +525,8 @@ def inspect_dataset_command(
     from vap_core.base.errors import require
 
     require("policy", "inspect-dataset")
-    from vap_core.analysis.dataset_inspection import TABLE, inspect_dataset, report_table
     from vap_core.base.errors import BadDataset, command
+    from vap_core.study.dataset import TABLE, inspect_dataset, report_table
 
     if masks and copy is None:
         raise BadDataset("inspect-dataset: --masks go into a copy; name its folder with --copy.")
@@ -544,5 +545,5 @@ def inspect_dataset_command(
     print(report_table(reports))
     first = out / "episode_000000.rrd"
     copied = f" and the dataset {copy}" if copy is not None else ""
-    print(f"wrote {out / TABLE}, {len({r.episode for r in reports})} recordings{copied}")
+    print(f"wrote {out / TABLE}, {len({row['episode'] for row in reports})} recordings{copied}")
     print(f"look: {command('view', first)}")

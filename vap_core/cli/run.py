@@ -131,12 +131,11 @@ class AskedOfAll(Asked):
             "too. Default as its checkpoint says; the shipped ones have 0, no noise.",
         ),
     ] = None
-    engine: Annotated[
-        Literal["local", "ray"],
-        typer.Option(help="local: processes of this machine; ray: a Ray cluster."),
-    ] = "local"
-    address: Annotated[
-        str | None, typer.Option(help="ray: host:port of the cluster. Default 127.0.0.1:6379.")
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Run on this Ray cluster, not in processes of this machine."
+        ),
     ] = None
     video: Annotated[
         bool,
@@ -173,12 +172,6 @@ class AskedOfAll(Asked):
             "input, too.",
         ),
     ] = False
-    images_every: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Expert and random: render all cameras every so many steps; 0 never."
-        ),
-    ] = 0
     robots: Annotated[
         str,
         typer.Option(
@@ -255,35 +248,40 @@ def evaluate(asked: AskedOfAll) -> None:
     Example: python -m vap_core eval --suite tabletop --object mug --out data/runs/mug
     Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4
         --out data/runs/all
-    Example: python -m vap_core eval --suite all --engine ray --address 10.0.0.5:6379
+    Example: python -m vap_core eval --suite all --ray 10.0.0.5:6379
     """
     run_suites(asked)
 
 
-@app.command()
-def ablate(
+@dataclass(frozen=True)
+class AskedOfAblation:
+    """The options of ablate."""
+
     name: Annotated[
         str | None,
         typer.Argument(help="The ablation; without a name they are listed with their arms."),
-    ] = None,
+    ] = None
     suite: Annotated[
         list[str] | None,
         typer.Option(help="A suite; repeatable. Default that of the ablation."),
-    ] = None,
+    ] = None
     out: Annotated[
         Path,
         typer.Option(
             help="Folder of the runs, one an arm; ablations share their arms, and what is there "
             "is not run again."
         ),
-    ] = Path("data/runs/ablations"),
-    policy: Policy = None,
-    episodes: PerTask = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1,
-    split: SplitName = "",
-    workers: Workers = 2,
-    record: Recorded = None,
-) -> None:
+    ] = Path("data/runs/ablations")
+    policy: Policy = None
+    episodes: PerTask = None
+    seeds: Annotated[int, typer.Option(min=1, help="Run every episode with so many seeds.")] = 1
+    split: SplitName = ""
+    workers: Workers = 2
+
+
+@app.command()
+@takes(AskedOfAblation)
+def ablate(asked: AskedOfAblation) -> None:
     """Change one thing of the method at a time, and compare every arm with the method itself on the
     same episodes; draws OUT/NAME.png. Interrupted, the same command goes on.
 
@@ -292,15 +290,17 @@ def ablate(
     Example: python -m vap_core ablate rewrite --suite simpler-fractal --split "visual matching"
     """
     from vap_core.base.errors import BadStudy, one_of
-    from vap_core.base.files import align
     from vap_core.study.methods import ABLATIONS
 
+    name = asked.name
     if name is None:
+        from vap_core.study.table import printed
+
         rows = [["ablation", "question", "arms"]]
         for each, about in ABLATIONS.items():
             of = f"; of the policies {', '.join(about.policies)}" if about.policies else ""
             rows.append([each, about.question, ", ".join(about.names) + of])
-        print(align(rows))
+        print(printed(rows))
         print("next: python -m vap_core ablate form --suite simpler-bridge --episodes 6")
         return
     if name not in ABLATIONS:
@@ -308,21 +308,13 @@ def ablate(
     from vap_core.study.ablations import ablate_text
 
     about = ABLATIONS[name]
-    if about.policies:
-        if policy is not None:
-            raise BadStudy(f"ablate {name}: it compares policies of its own; leave --policy out.")
-        policy = next(iter(about.policies.values()))
-    study = study_of(
-        AskedOfAll(
-            suite or list(about.suites),
-            methods=list(about.names),
-            policy=policy,
-            episodes=episodes,
-            seeds=seeds,
-            split=split,
-        )
-    )
-    print(ablate_text(name, study, out, workers=workers, record=record_of(record or "none")))
+    if about.policies and asked.policy is not None:
+        raise BadStudy(f"ablate {name}: it compares policies of its own; leave --policy out.")
+    given = {"suite": asked.suite or list(about.suites), "methods": list(about.names)}
+    given["policy"] = next(iter(about.policies.values()), asked.policy)
+    of_study = {field: getattr(asked, field) for field in ("episodes", "seeds", "split")}
+    study = study_of(AskedOfAll(**given, **of_study))
+    print(ablate_text(name, study, asked.out, workers=asked.workers))
 
 
 def run_suites(asked: AskedOfAll) -> None:
@@ -330,7 +322,7 @@ def run_suites(asked: AskedOfAll) -> None:
 
     What can be checked before anything large is imported is checked first.
     """
-    from vap_core.base.errors import BadStudy, BadSuite
+    from vap_core.base.errors import BadSuite
     from vap_core.policies.protocol import check_policy_name
 
     if asked.record is not None:
@@ -340,12 +332,10 @@ def run_suites(asked: AskedOfAll) -> None:
             raise BadSuite(f"suites: {name} is no Python file; name one that ends in .py.")
     if asked.policy is not None:
         check_policy_name(asked.policy)
-    if asked.address and asked.engine != "ray":
-        raise BadStudy("eval: --address needs --engine ray.")
     from vap_core.study.engine import probable_policy, start_server
 
     likely = asked.policy or probable_policy(asked.suite)
-    if likely and asked.engine == "local":
+    if likely and not asked.ray:
         start_server(likely, asked.out or default_folder(likely, asked))
     study = study_of(asked)
     run_study(study, replace(asked, out=asked.out or default_folder(study.policy, asked)))
@@ -430,17 +420,15 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
     from vap_core.base.errors import BadStudy
     from vap_core.policies.protocol import PRIVILEGED
     from vap_core.rollout.calls import named_queries
-    from vap_core.study.cluster import ray_executor
     from vap_core.study.engine import run
-    from vap_core.study.processes import results
     from vap_core.study.report import conclude
     from vap_core.study.stats import detectable_effect_text
     from vap_core.study.store import MANIFEST
+    from vap_core.study.workers import ray_executor, results
 
     out = asked.out or default_folder(study.policy, asked)
-    address = asked.address or ("127.0.0.1:6379" if asked.engine == "ray" else None)
-    if study.object and address:
-        raise BadStudy("--object: other machines do not have your objects; use --engine local.")
+    if study.object and asked.ray:
+        raise BadStudy("--object: other machines do not have your objects; leave --ray out.")
     record = record_of(asked.record or ("none" if study.policy in PRIVILEGED else "failures"))
     queries = named_queries(names(asked.attention))
     if record == "none" and (asked.video or queries):
@@ -463,11 +451,11 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
     table = run(
         study,
         out,
-        workers=asked.workers or (0 if address else 2),
+        workers=asked.workers or (0 if asked.ray else 2),
         record=record,
         retries=asked.retries,
         policy_timeout_s=asked.policy_timeout,
-        executor=ray_executor(address) if address else results,
+        executor=ray_executor(asked.ray) if asked.ray else results,
         video=asked.video,
         attention=queries,
     )

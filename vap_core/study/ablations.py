@@ -1,114 +1,154 @@
-"""Runs an ablation, one run an arm: its table and its picture (P appendix)."""
+"""Runs an ablation, one run an arm: its table and its picture (P appendix).
 
-from collections.abc import Mapping, Sequence
+arms = ablation_table(published_episodes(Path("data/results/ablations.parquet")))
+effects_figure(arms)
+"""
+
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput
-from vap_core.base.files import align, writing
-from vap_core.base.pictures import method_marks, write_png
-from vap_core.base.types import value
+from vap_core.base.files import signed, writing
+from vap_core.base.pictures import write_png
 from vap_core.policies.protocol import TEMPERATURE, checkpoint_of
-from vap_core.study import paper, store
+from vap_core.study import charts, paper, store
 from vap_core.study.engine import Record, run
 from vap_core.study.logs import hiding_lines, switching_lines
 from vap_core.study.methods import ABLATIONS, Ablation
+from vap_core.study.results import read_runs
 from vap_core.study.stats import (
-    Comparison,
-    Rate,
     compare,
     holm,
-    layout_names,
     points_text,
     rate,
     rate_over_layouts,
+    tidy,
+    with_layouts,
 )
+from vap_core.study.table import percent, printed
 from vap_core.study.trials import Study
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 PAPER_SUITES = {"simpler-fractal": "Google Robot", "simpler-bridge": "WidowX"}
 """The columns of the paper's ablation tables for our suites."""
+LEVEL = 0.05
+"""The exact p, corrected over the arms of a suite, below which a difference counts as shown.
+
+A bootstrap interval alone does not say so where few episodes come out otherwise: with five of 96,
+all the same way, it leaves out 0, and the exact p is .06.
+"""
+AGAINST = ("difference", "low", "high", "p", "p_holm")
+COLUMNS = ["suite", "arm", "n", "sr", "cmr", "case 1", "case 2", *AGAINST, "shown", "paper"]
+"""The columns of an arm: its rates, and its difference from the first arm of its suite."""
 
 
-@value
-class ArmResult:
-    """One arm over all episodes of a suite; errors count as no success.
-
-    `against` compares it with the ablation's first arm on the same episodes; None for that arm.
-    Its `p_holm` is corrected over the arms of one suite. `paper` is the paper's SR, a fraction, nan
-    where it has none.
-    """
-
-    suite: str
-    arm: str
-    sr: Rate
-    cmr: Rate
-    case_1: Rate
-    case_2: Rate
-    against: Comparison | None
-    paper: float
-
-
-def arm_results(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
+def arm_table(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
     """The arms of every suite in `episodes` (rows of a results table) that ran the first arm and
-    another.
+    another, over all episodes of a suite; errors count as no success.
+
+    `sr`, `cmr`, `case 1` and `case 2` are `Estimate`s; `difference` compares an arm with the
+    ablation's first one on the same episodes, nan for that one. `p_holm` is corrected over the arms
+    of a suite (those that were retired count as p = 1), and `shown` where it is below LEVEL.
+    `paper` is the paper's SR, `paper_difference` its difference, nan where it has none.
 
     Raises: BadOutput when they are of several policies in a suite, when an arm shares no episode
-        with the first, and as `paper.ledger`; BadSuite, as `statistics.compare`.
+        with the first, and as `paper.ledger`; BadSuite, as `compare`.
     """
-    results = []
+    import pandas as pd
+
+    lines: list[dict[str, Any]] = []
     for suite in dict.fromkeys(episodes["suite"]):
-        of_suite = episodes[episodes["suite"] == suite].assign(split="")
-        of_suite["layout"] = layout_names(of_suite)
-        ran = set(of_suite["method"])
-        arms = [arm for arm in ablation.names if arm in ran]
-        if ablation.names[0] not in ran or len(arms) < 2:
+        of_suite = with_layouts(episodes[episodes["suite"] == suite].assign(split=""))
+        arms = [arm for arm in ablation.names if of_suite["method"].eq(arm).any()]
+        if ablation.names[0] not in arms or len(arms) < 2:
             continue
-        _refuse_policies(suite, of_suite[of_suite["method"].isin(arms)])
-        against = _against_default(arms, of_suite, ablation.retired)
+        policies = sorted(map(str, of_suite[of_suite["method"].isin(arms)]["policy"].unique()))
+        if len(policies) > 1:
+            raise BadOutput(
+                f"arm_table: the arms on {suite} are of {len(policies)} policies "
+                f"({', '.join(policies)}); name one: keep its rows alone. policy_tables compares "
+                "several."
+            )
+        against = _against_first(arms, of_suite, ablation.retired)
         for arm in arms:
             rows = of_suite[of_suite["method"] == arm]
-            results.append(
-                ArmResult(
-                    suite=suite,
-                    arm=arm,
-                    sr=_share(rows, "success"),
-                    cmr=_share(rows, "cmr"),
-                    case_1=rate(int(rows["case"].eq("case 1").sum()), len(rows)),
-                    case_2=rate(int(rows["case"].eq("case 2").sum()), len(rows)),
-                    against=against.get(arm),
-                    paper=_paper_sr(ablation, suite, arm),
-                )
-            )
-    return results
+            rates = {
+                name: rate_over_layouts(rows[rows[column].notna()], column)
+                for name, column in (("sr", "success"), ("cmr", "cmr"))
+            }
+            for case in ("case 1", "case 2"):
+                rates[case] = rate(int(rows["case"].eq(case).sum()), len(rows))
+            line = {"suite": suite, "arm": arm, "n": len(rows), **rates, **against.get(arm, {})}
+            lines.append({**line, "paper": _paper_sr(ablation, suite, arm)})
+    table = pd.DataFrame(lines, columns=COLUMNS)
+    table["shown"] = table["p_holm"] < LEVEL
+    firsts = table.groupby("suite", sort=False)["paper"].transform("first")
+    return table.assign(paper_difference=(table["paper"] - firsts).where(table["p"].notna()))
 
 
-def policy_results(ablation: Ablation, episodes: "pd.DataFrame") -> dict[str, list[ArmResult]]:
-    """The methods of an ablation of policies, by the label of the policy that was run; each method
-    against the first one with the same policy.
+def _against_first(
+    arms: Sequence[str], of_suite: "pd.DataFrame", retired: int
+) -> dict[str, dict[str, float]]:
+    """Each arm against the first, over all tasks of the suite; `retired` arms count as p = 1.
 
-    Raises: as `arm_results`.
+    Raises: BadOutput for one that shares no episode with the first.
     """
+    first, *others = arms
     found = {}
-    for label, checkpoint in ablation.policies.items():
-        results = arm_results(ablation, _of_checkpoint(episodes, checkpoint))
-        if results:
-            found[label] = results
+    for arm in others:
+        part = of_suite[of_suite["method"].isin([first, arm])]
+        compared = compare(part, [first, arm], by_task=False)
+        if compared.empty:
+            suite = part["suite"].iloc[0]
+            raise BadOutput(
+                f"arm_table: {arm} shares no episode with {first} on {suite}, so they cannot "
+                f"be compared; run it on {first}'s episodes (the same seeds), or leave its rows "
+                "out."
+            )
+        found[arm] = compared.iloc[0][list(AGAINST)].to_dict()
+    corrected = holm([*(each["p"] for each in found.values()), *[1.0] * retired])
+    for each, p in zip(found.values(), corrected, strict=False):
+        each["p_holm"] = p
     return found
 
 
-def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmResult]:
+def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:
+    if arm not in ablation.rows or suite not in PAPER_SUITES:
+        return float("nan")
+    facts = paper.ledger()
+    named = {"table": ablation.paper, "row": ablation.rows[arm], "column": PAPER_SUITES[suite]}
+    for column, name in (named | {"metric": "SR"}).items():
+        facts = facts[facts[column].eq(name)]
+    return float(facts["value"].iloc[0]) / 100 if len(facts) else float("nan")
+
+
+def policy_tables(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """The methods of an ablation of policies, with the label of the `policy` that was run; each
+    method against the first one with the same policy.
+
+    Raises: as `arm_table`.
+    """
+    import pandas as pd
+
+    tables = []
+    for label, checkpoint in ablation.policies.items():
+        arms = arm_table(ablation, _of_checkpoint(episodes, checkpoint))
+        arms.insert(0, "policy", label)
+        tables.append(arms)
+    return pd.concat([table for table in tables if len(table)], ignore_index=True)
+
+
+def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
     """The last method of an ablation of policies; its arms are the labels of the policies, each
     against the first one on the same episodes.
 
-    Raises: as `arm_results`.
+    Raises: as `arm_table`.
     """
     import pandas as pd
 
@@ -118,7 +158,7 @@ def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> list[ArmRes
         part = _of_checkpoint(episodes, checkpoint)
         parts.append(part[part["method"] == method].assign(method=label, policy=method))
     labels = Ablation(ablation.question, arms={}, methods=tuple(ablation.policies))
-    return arm_results(labels, pd.concat(parts, ignore_index=True))
+    return arm_table(labels, pd.concat(parts, ignore_index=True))
 
 
 def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
@@ -128,231 +168,148 @@ def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
     return episodes[named & ~labels.str.contains(TEMPERATURE, regex=False)]
 
 
-def arm_rows(results: list[ArmResult]) -> list[list[str]]:
-    """The table as text cells, header first; rates and differences in percent."""
-    rows = [
-        [
-            "suite",
-            "arm",
-            "n",
-            "SR % [95 %]",
-            "CMR % [95 %]",
-            "case 1",
-            "case 2",
-            "against the first, points [95 %]",
-            "p Holm",
-            "paper's SR %",
-        ]
-    ]
-    for one in results:
-        difference = p = "-"
-        if one.against is not None:
-            difference = points_text(one.against, digits=1)
-            p = f"{one.against.p_holm:.3g}"
-        published = "-" if one.paper != one.paper else f"{100 * one.paper:.1f}"
-        cells = [one.suite, one.arm, str(one.sr.n), str(one.sr), str(one.cmr)]
-        cases = [str(one.case_1.k), str(one.case_2.k)]
-        rows.append([*cells, *cases, difference, p, published])
-    return rows
+def published_episodes(path: Path) -> "pd.DataFrame":
+    """Every episode of a published table. Raises: BadOutput."""
+    import pandas as pd
+
+    return pd.concat([episodes for _, episodes in read_runs(path)], ignore_index=True)
 
 
-def _against_default(
-    arms: Sequence[str], of_suite: "pd.DataFrame", retired: int
-) -> dict[str, Comparison]:
-    """Each arm against the first, over all tasks of the suite; `retired` arms count as p = 1.
+def ablation_table(episodes: "pd.DataFrame", *suites: str) -> "pd.DataFrame":
+    """The arms of every `ablation` that has been run, each against the first of its ablation.
 
-    Raises: BadOutput for one that shares no episode with the first.
+    Of these suites, or of those that an ablation runs on where none is named. Those of policies are
+    not among them (`policy_tables`, `across_policies`).
+
+    Raises: as `arm_table`.
     """
-    default, *others = arms
-    found = {}
-    for arm in others:
-        part = of_suite[of_suite["method"].isin([default, arm])]
-        comparisons = compare(part, [default, arm], by_task=False)
-        if not comparisons:
-            suite = part["suite"].iloc[0]
-            raise BadOutput(
-                f"arm_results: {arm} shares no episode with {default} on {suite}, so they cannot "
-                f"be compared; run it on {default}'s episodes (the same seeds), or leave its rows "
-                "out."
-            )
-        (found[arm],) = comparisons
-    p_holm = holm([*(comparison.p for comparison in found.values()), *[1.0] * retired])
-    corrected = {}
-    for (arm, comparison), p in zip(found.items(), p_holm, strict=False):
-        corrected[arm] = replace(comparison, p_holm=p)
-    return corrected
+    import pandas as pd
+
+    tables = [pd.DataFrame(columns=["ablation", *COLUMNS, "paper_difference"])]
+    for name, ablation in ABLATIONS.items():
+        wanted = episodes["suite"].isin(suites or ablation.suites)
+        arms = arm_table(ablation, episodes[wanted]) if not ablation.policies else ()
+        if len(arms):
+            arms.insert(0, "ablation", name)
+            tables.append(arms)
+    return pd.concat(tables[1:] or tables, ignore_index=True)
 
 
-def _refuse_policies(suite: str, of_arms: "pd.DataFrame") -> None:
-    """Raises: BadOutput for more than one policy."""
-    policies = sorted(map(str, of_arms["policy"].unique()))
-    if len(policies) > 1:
-        raise BadOutput(
-            f"arm_results: the arms on {suite} are of {len(policies)} policies "
-            f"({', '.join(policies)}); name one: keep its rows alone. policy_results compares "
-            "several."
-        )
+def shown_table(arms: "pd.DataFrame") -> "pd.DataFrame":
+    """Arms to print; rates and differences in percent."""
+    table = arms[["suite", "arm", "n"]].copy()
+    table["SR % [95 %]"], table["CMR % [95 %]"] = arms["sr"].map(str), arms["cmr"].map(str)
+    for case in ("case 1", "case 2"):
+        table[case] = [each.k for each in arms[case]]
+    points = [points_text(line, 1) if line.p == line.p else "-" for line in arms.itertuples()]
+    table["against the first, points [95 %]"] = points
+    table["p Holm"] = [f"{p:.3g}" if p == p else "-" for p in arms["p_holm"]]
+    return table.assign(**{"paper's SR %": arms["paper"].map(percent)})
 
 
-def _share(rows: "pd.DataFrame", column: str) -> Rate:
-    """The share of episodes in which it holds, of those that can say, as `metrics.count` does; its
-    interval is over layouts where one returns.
+def effects_figure(arms: "pd.DataFrame", title: str = "", columns: int = 1) -> "Figure":
+    """Points of success of every arm against the first arm of its suite, filled where a difference
+    is shown; the paper's difference, where it has both arms, is a diamond.
+
+    With the column `ablation` a heading for each; the headings are spread over `columns`. A column
+    `series` tells the marks of one line apart.
     """
-    return rate_over_layouts(rows[rows[column].notna()], column)
-
-
-def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:
-    if arm not in ablation.rows or suite not in PAPER_SUITES:
-        return float("nan")
-    facts = paper.ledger()
-    facts = facts[
-        facts["table"].eq(ablation.paper)
-        & facts["row"].eq(ablation.rows[arm])
-        & facts["column"].eq(PAPER_SUITES[suite])
-        & facts["metric"].eq("SR")
-    ]
-    return float(facts["value"].iloc[0]) / 100 if len(facts) else float("nan")
-
-
-CLEAR, UNCLEAR = "#0072b2", "#9aa0a6"
-"""Differences that are shown, and those that are not."""
-LEVEL = 0.05
-"""The exact p, corrected over the arms of a suite, below which a difference counts as shown."""
-PAPER = "#d55e00"
-OTHER = "#cc79a7"
-"""Another policy's differences."""
-
-
-def effects_figure(results: Sequence[ArmResult], title: str) -> "Figure":
-    """One row per arm and suite: the difference in SR with its 95 % interval.
-
-    A diamond is the paper's difference, where the paper has both arms.
-    """
-    from matplotlib.figure import Figure as NewFigure
-
-    first = {one.suite: one for one in results if one.against is None}
-    shown = [one for one in results if one.against is not None]
-    figure = NewFigure(figsize=(7.2, 1.1 + 0.3 * len(shown)), layout="constrained")
-    axes = figure.subplots()
-    for y, one in enumerate(reversed(shown)):
-        draw_effects(axes, one, results, y)
-    axes.axvline(0, color="black", linewidth=0.8)
-    axes.set_yticks(range(len(shown)), [_label(one, first) for one in reversed(shown)])
-    axes.set_xlabel("success rate against the first arm, points (95 % interval)")
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(
-        handles=legend_handles(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
+    names = [name for name in ("ablation", "suite") if name in arms and arms[name].nunique() > 1]
+    headings = {}
+    firsts = arms[arms["p"].isna()]
+    for line in firsts.drop_duplicates(names or ["suite"]).to_dict("records"):
+        key = tuple(line[name] for name in names)
+        about = f"against {line['arm']}, {100 * line['sr'].value:.0f} % of {line['n']}"
+        headings[key] = f"{' on '.join(map(str, key))}: {about}" if key else about
+    shown = arms[arms["p"].notna()]
+    keys = list(zip(*(shown[name] for name in names), strict=True)) if names else [()] * len(shown)
+    lines = shown[["arm"]].assign(
+        heading=list(map(headings.get, keys)),
+        value=shown["difference"],
+        low=shown["low"],
+        high=shown["high"],
+        filled=shown["shown"],
+        paper=shown["paper_difference"],
+        series=shown.get("series", ""),
     )
-    return figure
-
-
-def draw_effects(
-    axes: "Axes", one: ArmResult, results: Sequence[ArmResult], y: int | float
-) -> None:
-    """An arm's difference from the first arm of its suite among `results`, at height `y`."""
-    assert one.against is not None
-    low, mid, high = _points(one.against)
-    colour = CLEAR if is_shown(one.against) else UNCLEAR
-    axes.plot([low, high], [y, y], color=colour, linewidth=2)
-    axes.plot(mid, y, "o", color=colour)
-    (first,) = [each for each in results if each.suite == one.suite and each.against is None]
-    theirs = 100 * (one.paper - first.paper)
-    if theirs == theirs:
-        axes.plot(theirs, y, "D", color=PAPER, markersize=5, fillstyle="none")
-
-
-def draw_other(axes: "Axes", one: ArmResult, y: float) -> None:
-    """The difference of the same arm with another policy, at height `y`."""
-    assert one.against is not None
-    low, mid, high = _points(one.against)
-    axes.plot([low, high], [y, y], color=OTHER, linewidth=1)
-    axes.plot(mid, y, "s", color=OTHER, markersize=2.5)
-
-
-def _points(found: Comparison) -> tuple[float, float, float]:
-    return 100 * found.low, 100 * found.difference, 100 * found.high
-
-
-def policies_figure(
-    of_policies: Mapping[str, Sequence[ArmResult]],
-    label: str,
-    again: Sequence[Sequence[ArmResult]] = (),
-) -> "Figure":
-    """The success rate of every method (95 %), with the policies side by side; `label` says what
-    tells them apart. `again` has another training of each, drawn hollow.
-    """
-    from matplotlib.figure import Figure as NewFigure
-
-    figure = NewFigure(figsize=(4.6, 3.0), layout="constrained")
-    axes = figure.subplots()
-    methods = dict.fromkeys(one.arm for results in of_policies.values() for one in results)
-    for i, (method, (colour, marker)) in enumerate(method_marks(list(methods)).items()):
-        offset = 0.08 * (i - (len(methods) - 1) / 2)
-        look = {"color": colour, "marker": marker}
-        _draw_rates(axes, list(of_policies.values()), method, offset, label=method, **look)
-        if again:
-            hollow = {**look, "markerfacecolor": "white", "linestyle": ":"}
-            _draw_rates(axes, again, method, offset + 0.04, **hollow)
-    n = ", ".join(dict.fromkeys(str(one.sr.n) for part in of_policies.values() for one in part))
-    axes.set_xticks(range(len(of_policies)), list(of_policies))
-    axes.set(xlabel=label, ylabel=f"success rate, % (95 %, n {n})", ylim=(-3, 103))
-    axes.spines[["top", "right"]].set_visible(False)
-    title = "hollow: trained\na second time" if again else None
-    figure.legend(
-        loc="outside right center", frameon=False, fontsize=8, title=title, title_fontsize=8
+    order = list(dict.fromkeys(lines["heading"]))
+    done = lines.groupby("heading", sort=False).size().add(1).cumsum().shift(fill_value=0)
+    lines["panel"] = (
+        lines["heading"]
+        .map(done * columns // (len(lines) + len(order)))
+        .map(lambda part: " " * (int(part) + 1))
     )
-    return figure
+    label = f"points of success against the first arm [95 %]; filled: exact p < {LEVEL:g}, Holm"
+    series = "series" if lines["series"].nunique() > 1 else ""
+    look = dict(group="heading", panel="panel", series=series, title=title)
+    return charts.dots(lines, "arm", label=label, limits=(-103.0, 48.0), **look)
 
 
-def _draw_rates(
-    axes: "Axes",
-    of_policies: Sequence[Sequence[ArmResult]],
-    method: str,
-    offset: float,
-    **look: Any,
-) -> None:
-    """One method's success rate at each policy's place."""
-    xs, rates = [], []
-    for x, results in enumerate(of_policies):
-        for one in results:
-            if one.arm == method:
-                xs.append(x + offset)
-                rates.append(one.sr)
-    bounds = [
-        [100 * (one.value - one.low) for one in rates],
-        [100 * (one.high - one.value) for one in rates],
-    ]
-    axes.errorbar(xs, [100 * one.value for one in rates], bounds, capsize=2, **look)
+def rates_figure(arms: "pd.DataFrame") -> "Figure":
+    """The success rate of every arm, a panel per suite; the paper's are diamonds."""
+    rates = tidy(arms[["suite", "arm", "sr", "paper"]], ["sr"])
+    return charts.dots(rates, "arm", panel="suite", label="success rate, % (95 % interval)")
 
 
-def is_shown(found: Comparison) -> bool:
-    """Whether a difference is beyond chance.
+def sweep_figure(arms: "pd.DataFrame", places: dict[str, float], label: str) -> "Figure":
+    """Success rates along a quantity, of which `places` has every arm's, a panel per suite."""
+    rates = tidy(arms[arms["arm"].isin(places)][["suite", "arm", "sr", "paper"]], ["sr"])
+    rates = rates.assign(x=rates["arm"].map(places)).sort_values("x", kind="stable")
+    names = rates["suite"] + ", n " + rates["n"].astype(str)
+    look = dict(panel="panel", label="success rate, % (95 %)", label_x=label)
+    return charts.curves(rates.assign(panel=names), "x", **look)
 
-    A bootstrap interval alone does not say so where few episodes come out otherwise: with five of
-    96, all the same way, it leaves out 0, and the exact p is .06.
+
+def policies_figure(arms: "pd.DataFrame", label: str) -> "Figure":
+    """The success rate of every method (95 %), with the policies of `policy_tables` side by side;
+    `label` says what tells them apart."""
+    rates = tidy(arms[["policy", "arm", "sr"]], ["sr"])
+    return charts.bars(rates, "policy", series="arm", label="success rate, % (95 %)", label_x=label)
+
+
+def effect_text(arms: "pd.DataFrame", arm: str, suite: str = "") -> str:
+    """Points of success of an arm against the first, with its interval; of the first its rate.
+
+    `suite` says which, where there are several.
     """
-    return found.p_holm < LEVEL
+    found = arms[arms["arm"] == arm]
+    (one,) = (found[found["suite"] == suite] if suite else found).itertuples()
+    return points_text(one) if one.p == one.p else f"{100 * one.sr.value:.0f} % of {one.n}"
 
 
-def legend_handles(whose: str = "") -> "list[Line2D]":
-    """What the marks of `draw_effects` mean, and those of `draw_other`: `whose` they are."""
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=CLEAR, marker="o", label=f"a difference (exact p < {LEVEL:g}, Holm)"),
-        Line2D([], [], color=UNCLEAR, marker="o", label="none shown"),
-        Line2D([], [], color=PAPER, marker="D", fillstyle="none", linewidth=0, label="the paper's"),
-    ]
-    if whose:
-        handles.append(Line2D([], [], color=OTHER, marker="s", linewidth=1, label=whose))
-    return handles
+NO_POINT = 0.005
+"""Differences of success below it round to no point."""
 
 
-def _label(one: ArmResult, first: dict[str, ArmResult]) -> str:
-    if len(first) == 1:
-        return f"{one.arm}, n {one.sr.n}"
-    return f"{one.suite} {one.arm}, n {one.sr.n}"
+def findings_table(arms: "pd.DataFrame") -> "pd.DataFrame":
+    """Whether the paper's ablations hold here: every arm that it has, in points of success."""
+    both = arms[arms["paper_difference"].notna()]
+    return both[["ablation", "arm", "n"]].assign(
+        **{
+            "here, points [95 %]": list(map(points_text, both.itertuples())),
+            "paper": [signed(100 * each) for each in both["paper_difference"]],
+            "the paper's finding": list(map(verdict, both.itertuples())),
+        }
+    )
+
+
+def verdict(found: Any) -> str:
+    """What a difference that was found says about the paper's.
+
+    The paper's own error is not known, and not counted; its difference that rounds to no point is
+    none.
+    """
+    theirs = found.paper_difference
+    if abs(theirs) < NO_POINT:
+        return "there is none, here is one" if found.shown else "none is shown in either"
+    if not found.shown:
+        beyond = theirs < found.low if theirs < 0 else theirs > found.high
+        return "not here: as much is excluded" if beyond else "cannot tell"
+    if found.low <= theirs <= found.high:
+        return "holds"
+    if theirs * found.difference < 0:
+        return "the other way round"
+    return "holds, weaker" if abs(theirs) > abs(found.difference) else "holds, stronger"
 
 
 def ablate_text(
@@ -360,17 +317,22 @@ def ablate_text(
 ) -> str:
     """Run what `root` lacks, draw `NAME.png` there, and return the table.
 
-    Raises: what `engine.run` and `arm_results` raise.
+    Raises: what `engine.run` and `arm_table` raise.
     """
     ablation = ABLATIONS[name]
     episodes = run_arms(name, study, root, workers=workers, record=record)
     picture = root / f"{name}.png"
     if ablation.policies:
-        tables, figure = _of_policies(name, episodes)
-        policy = "each by its label"
+        of_policies = policy_tables(ablation, episodes)
+        tables = []
+        for label, arms in of_policies.groupby("policy", sort=False):
+            tables += [f"{label}: {ablation.policies[str(label)]}", printed(shown_table(arms))]
+        across = printed(shown_table(across_policies(ablation, episodes)))
+        tables += [f"{ablation.names[-1]} with every policy, against the first", across]
+        figure, policy = policies_figure(of_policies, name), "each by its label"
     else:
-        results = arm_results(ablation, episodes)
-        tables, figure = [align(arm_rows(results))], effects_figure(results, ablation.question)
+        arms = arm_table(ablation, episodes)
+        tables, figure = [printed(shown_table(arms))], effects_figure(arms, ablation.question)
         policy = study.policy
     with writing(picture, "ablate"):
         write_png(figure, picture, dpi=200)
@@ -389,18 +351,6 @@ def ablate_text(
         f"every arm is a run of its own: {study.next_command('diagnose', first)}",
     ]
     return "\n".join(lines)
-
-
-def _of_policies(name: str, episodes: "pd.DataFrame") -> "tuple[list[str], Figure]":
-    """A table for every policy, and one that compares the policies; and their picture."""
-    ablation = ABLATIONS[name]
-    of_policies = policy_results(ablation, episodes)
-    tables = []
-    for label, results in of_policies.items():
-        tables += [f"{label}: {ablation.policies[label]}", align(arm_rows(results))]
-    across = align(arm_rows(across_policies(ablation, episodes)))
-    tables += [f"{ablation.names[-1]} with every policy, against the first", across]
-    return tables, policies_figure(of_policies, name)
 
 
 def run_arms(

@@ -35,10 +35,10 @@ from vap_core.study import store
 from vap_core.study.engine import BATCH, spread_evenly
 from vap_core.study.failures import listed_row, note_changed, study_of
 from vap_core.study.methods import needs_token
-from vap_core.study.processes import prepare, results
 from vap_core.study.results import read_runs
 from vap_core.study.stats import layout_name
 from vap_core.study.trials import Study, make_trial, register_personal
+from vap_core.study.workers import prepare, results
 
 if TYPE_CHECKING:
     import pandas as pd

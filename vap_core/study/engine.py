@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,9 +24,10 @@ from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation import suites
 from vap_core.simulation.types import AS_LISTED, EpisodeRow, Outcome
 from vap_core.study import diagnosis, logs, steps, store
-from vap_core.study.processes import prepare, results
+from vap_core.study.measurement import Executor, work_off
 from vap_core.study.store import MANIFEST, read_manifest
 from vap_core.study.trials import Study, make_trial, register_personal
+from vap_core.study.workers import prepare, results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -184,6 +184,11 @@ class Job:
     attention: tuple[str, ...] = ()
     policy_timeout_s: float | None = None
 
+    def settings(self) -> dict[str, Any]:
+        """The run's configuration, as it is on this machine. Raises: as `Study.configuration`."""
+        self.study.open_suites()
+        return self.study.configuration()
+
 
 def run_job(job: Job) -> Rows:
     """Run one job in this process, and return a row of the results table for each episode.
@@ -306,8 +311,6 @@ def _recorders(job: Job) -> Callable[[EpisodeHeader], "Recorder | DeferredRecord
     return begin
 
 
-Executor = Callable[[Callable[[Job], Rows], Sequence[Job], int, str], Iterator[tuple[Job, Rows]]]
-"""How jobs reach processes: `processes.results`, or `cluster.ray_executor`'s."""
 LONE_DEATHS = 3
 """So many episodes in a row that end their worker mean that the machine is at fault, not they."""
 KeyedRow = tuple[EpisodeRow, str]
@@ -340,13 +343,9 @@ def run(
     def missing() -> list[Job]:
         # A run that was interrupted may be again: its first jobs end soon, and are kept.
         short = max(workers, 1) if resumed else 0
-        jobs = missing_jobs(study, folder, record, retries, short)
-        complete = []
-        for job in jobs:
-            complete.append(
-                replace(job, video=video, attention=attention, policy_timeout_s=policy_timeout_s)
-            )
-        return complete
+        how: dict[str, Any] = dict(video=video, attention=attention)
+        how["policy_timeout_s"] = policy_timeout_s
+        return [replace(job, **how) for job in missing_jobs(study, folder, record, retries, short)]
 
     store.open_run(folder, study.configuration())
     for line in unknown_words_notes(study):
@@ -359,55 +358,46 @@ def run(
         register_personal(study, folder / "memory")
         table = store.read(folder)
         with tqdm(
-            total=len(study.methods) * _count_rows(study),
+            total=len(study.methods) * sum(len(study.rows(*task)) for task in study.tasks),
             initial=len(table),
             unit="episode",
             disable=not progress,
             smoothing=0.05,
         ) as bar:
-            counts = _count_by_method(table)
+            counts = {
+                str(method): Counter(success=int(part.success.sum()), n=len(part))
+                for method, part in table.groupby("method")
+            }
             counted = set(map(store.key_of, table.to_dict("records")))
-            deaths = 0
-            jobs = missing()
-            while jobs:
-                if deaths > retries:
-                    finished = run_alone(jobs, executor, retries, bool(len(store.read(folder))))
-                else:
-                    finished = executor(run_job, jobs, workers, "--workers")
-                try:
-                    for job, rows in finished:
-                        store.append(folder, rows)
-                        deaths = 0
-                        _show_progress(bar, counts, counted, job.method, rows)
-                except WorkerDied:
-                    deaths += 1
-                    if deaths > retries + 1:
-                        raise
-                    how = "again" if deaths <= retries else "one episode at a time"
-                    bar.write(
-                        f"note: a worker process died; what it was doing runs {how} "
-                        f"({deaths} of {retries + 1} deaths).",
-                        file=sys.stderr,
-                    )
-                jobs = missing()
+
+            def keep(job: Job, rows: Rows) -> None:
+                store.append(folder, rows)
+                _show_progress(bar, counts, counted, job.method, rows)
+
+            def alone(jobs: Sequence[Job]) -> Iterator[tuple[Job, Rows]]:
+                return run_alone(jobs, executor, retries, bool(len(store.read(folder))))
+
+            def note(deaths: int) -> None:
+                how = "again" if deaths <= retries else "one episode at a time"
+                bar.write(
+                    f"note: a worker process died; what it was doing runs {how} "
+                    f"({deaths} of {retries + 1} deaths).",
+                    file=sys.stderr,
+                )
+
+            more: dict[str, Any] = dict(retries=retries, alone=alone, note=note)
+            work_off(missing, run_job, keep, executor, workers, **more)
         store.compact(folder)
     table = store.read(folder)
-    note = _errors_note(table)
-    if note:
-        print(note, file=sys.stderr)
-    return table
-
-
-def _errors_note(table: "pd.DataFrame") -> str:
-    """How episodes that ended in an error, tried as often as was asked for, are tried again."""
     errors = table[table["outcome"] == "error"]
-    if errors.empty:
-        return ""
-    episodes = "1 episode is an error" if len(errors) == 1 else f"{len(errors)} episodes are errors"
-    return (
-        f"note: {episodes}; when the cause is mended, the same command with --retries "
-        f"{int(errors['attempt'].max())} tries again."
-    )
+    if len(errors):
+        episodes = f"{len(errors)} episodes are errors"
+        print(
+            f"note: {'1 episode is an error' if len(errors) == 1 else episodes}; when the cause is "
+            f"mended, the same command with --retries {int(errors['attempt'].max())} tries again.",
+            file=sys.stderr,
+        )
+    return table
 
 
 def run_alone(
@@ -421,7 +411,12 @@ def run_alone(
     Raises: WorkerDied.
     """
     dead: list[tuple[Job, Rows]] = []
-    for job in chain.from_iterable(map(_split, jobs)):
+    singles = [
+        replace(job, rows=(row,), keys=(key,))
+        for job in jobs
+        for row, key in zip(job.rows, job.keys, strict=True)
+    ]
+    for job in singles:
         try:
             found = list(executor(run_job, [job], 1, "--workers"))
         except WorkerDied as error:
@@ -439,14 +434,6 @@ def run_alone(
     yield from dead
 
 
-def _split(job: Job) -> list[Job]:
-    """A job of each of its episodes."""
-    singles = []
-    for row, key in zip(job.rows, job.keys, strict=True):
-        singles.append(replace(job, rows=(row,), keys=(key,)))
-    return singles
-
-
 def missing_jobs(
     study: Study, folder: Path, record: Record = "none", retries: int = 0, short: int = 0
 ) -> Iterator[Job]:
@@ -459,12 +446,14 @@ def missing_jobs(
     Raises: BadOutput when the run's manifest is absent, or a part is damaged.
     """
     run_digest = store.read_manifest(folder)["digest"]
-    attempts = _attempts(store.read(folder))
+    table = store.read(folder)
+    attempts = {row.key: (row.attempt, row.outcome) for row in table.itertuples()}
     given = 0
     for method in reversed(study.methods):
         for suite, task in study.tasks:
             rows = [(row, result_key(row, method, run_digest)) for row in study.rows(suite, task)]
-            chosen = _chosen_keys(rows, record)
+            recorded = spread_evenly(rows, record) if isinstance(record, int) else []
+            chosen = frozenset(key for _, key in recorded)
             for (_, attempt), group in _missing_groups(rows, attempts, retries).items():
                 record_now: Record = record if attempt == 1 else "all"
                 first = 0
@@ -503,22 +492,6 @@ def spread_evenly[T](items: Sequence[T], n: int) -> list[T]:
     return [items[i * len(items) // n] for i in range(n)]
 
 
-def _attempts(table: "pd.DataFrame") -> dict[str, tuple[int, str]]:
-    """The last attempt of every finished episode and its outcome, by key."""
-    attempts = {}
-    if not table.empty:
-        for row in table.itertuples():
-            attempts[row.key] = row.attempt, row.outcome
-    return attempts
-
-
-def _chosen_keys(rows: Sequence[KeyedRow], record: Record) -> frozenset[str]:
-    """The keys to record when `record` is a number."""
-    if not isinstance(record, int):
-        return frozenset()
-    return frozenset(key for _, key in spread_evenly(rows, record))
-
-
 def _missing_groups(
     rows: Sequence[KeyedRow], attempts: dict[str, tuple[int, str]], retries: int
 ) -> dict[tuple[str, int], list[KeyedRow]]:
@@ -529,21 +502,6 @@ def _missing_groups(
         if outcome == "error" and (tried == 0 or tried <= retries):
             groups.setdefault((row.variant, tried + 1), []).append((row, key))
     return groups
-
-
-def _count_rows(study: Study) -> int:
-    total = 0
-    for suite, task in study.tasks:
-        total += len(study.rows(suite, task))
-    return total
-
-
-def _count_by_method(table: "pd.DataFrame") -> dict[str, Counter[str]]:
-    """Successes and episodes of every method."""
-    counts = {}
-    for method, part in table.groupby("method"):
-        counts[str(method)] = Counter(success=int(part.success.sum()), n=len(part))
-    return counts
 
 
 def _show_progress(

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy, one_of
 from vap_core.base.files import (
-    align,
     code_digest,
     code_version,
     rows_matching,
@@ -26,15 +25,15 @@ from vap_core.base.files import (
     write_atomic,
     writing,
 )
-from vap_core.base.types import value
 from vap_core.rollout.types import CASES
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow, Outcome
 from vap_core.study import store
 from vap_core.study.diagnosis import STAGES, explain
 from vap_core.study.results import EXECUTED, read_runs, reads_simulator, scene_of
-from vap_core.study.stats import rate
+from vap_core.study.stats import rates
 from vap_core.study.store import KEY, ROW_KEY
+from vap_core.study.table import printed
 from vap_core.study.trials import Study, make_trial, policy_today, register_personal
 
 if TYPE_CHECKING:
@@ -189,14 +188,13 @@ def recorder_digest() -> str:
 
 BY = ["suite", "method"]
 """The columns that name a group of episodes here."""
-APART = ", "
-"""Between a method and a policy in the name of a group."""
 SUBGOAL = "subgoal"
 """The column of the sub-goal that was diagnosed, counted from 1, where there are several."""
 DIAGNOSIS_COLUMNS = ("case", "sub_case", "deciding_frame")
-
 PLAYED = ["suite", "task", "episode", "seed", "method"]
 """The columns that name a recording."""
+SUB_CASES = [f"{case}: {sub_case}" for case, named in CASES.items() for sub_case in named]
+"""The columns of a breakdown that count sub-cases."""
 
 
 def check_diagnosed(table: "pd.DataFrame") -> None:
@@ -215,11 +213,6 @@ def diagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
     """
     check_diagnosed(table)
     return table[table["case"].notna()].astype({"deciding_frame": int})
-
-
-def undiagnosed(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The episodes of runs that are older than the diagnosis, in a table that has others, too."""
-    return table[table["case"].isna()]
 
 
 def older_text(n_more: int) -> str:
@@ -264,11 +257,10 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
         of_case = failed & episodes["case"].eq(case)
         flat[case] = of_case.astype(int)
         for sub_case in sub_cases:
-            both = of_case & episodes["sub_case"].eq(sub_case)
-            flat[f"{case}: {sub_case}"] = both.astype(int)
-    for number in _subgoals(episodes):
-        failed_there = failed & episodes[SUBGOAL].eq(number)
-        flat[f"sub-goal {number}"] = failed_there.astype(int)
+            flat[f"{case}: {sub_case}"] = (of_case & episodes["sub_case"].eq(sub_case)).astype(int)
+    numbers = episodes.loc[failed, SUBGOAL].dropna() if SUBGOAL in episodes else ()
+    for number in sorted({int(number) for number in numbers}):
+        flat[f"sub-goal {number}"] = (failed & episodes[SUBGOAL].eq(number)).astype(int)
     counts = flat.groupby(BY, sort=False).sum().reset_index()
     with_case = episodes[failed & episodes["case"].ne("")].groupby(BY, sort=False)
     confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
@@ -280,61 +272,29 @@ def _by_policy(episodes: "pd.DataFrame") -> "pd.DataFrame":
     if "policy" not in episodes:
         return episodes
     several = episodes.groupby(BY)["policy"].transform("nunique") > 1
-    named = episodes["method"] + APART + episodes["policy"]
+    named = episodes["method"] + ", " + episodes["policy"]
     return episodes.assign(method=episodes["method"].mask(several, named))
 
 
-def _subgoals(episodes: "pd.DataFrame") -> list[int]:
-    """The numbers of the sub-goals that failed somewhere."""
-    if SUBGOAL not in episodes:
-        return []
-    failed = episodes.loc[episodes["outcome"].eq("failure"), SUBGOAL].dropna()
-    return sorted({int(number) for number in failed})
-
-
-def breakdown_rows(counts: "pd.DataFrame") -> list[list[str]]:
-    """`breakdown` as text cells, cases that never occurred left out.
+def breakdown_table(counts: "pd.DataFrame") -> "pd.DataFrame":
+    """`breakdown` to print, cases that never occurred left out.
 
     Failures in percent of all episodes, cases in percent of failures, each with its 95 % Wilson
     interval.
     """
-    cases: list[str] = []
-    titles = []
-    for case in CASES:
-        if counts[case].any():
-            cases.append(case)
-            titles.append(f"{case} % of failures")
-    for column in map(str, counts.columns):
-        if column.startswith("sub-goal "):
-            cases.append(column)
-            titles.append(f"{column} % of failures")
-    rows = [["suite", "method", "n", "fail % [95 %]", *titles, "confidence"]]
-    for line in counts.to_dict("records"):
-        n = int(line["n"])
-        failed = int(line["failed"])
-        failure_rate = rate(failed, n)
-        cells = [str(line["suite"]), str(line["method"]), str(line["n"]), str(failure_rate)]
-        for column in cases:
-            share = rate(int(line[column]), failed)
-            cells.append(str(share))
-        confidence = line["mean_confidence"]
-        cells.append("-" if confidence != confidence else f"{confidence:.2f}")
-        rows.append(cells)
-    return rows
-
-
-def _sub_case_columns() -> list[str]:
-    """The columns of a breakdown that count sub-cases."""
-    columns = []
-    for case, sub_cases in CASES.items():
-        for sub_case in sub_cases:
-            columns.append(f"{case}: {sub_case}")
-    return columns
+    table = counts[[*BY, "n"]].copy()
+    table["fail % [95 %]"] = rates(counts["failed"], counts["n"])
+    cases = [case for case in CASES if counts[case].any()]
+    for column in (*cases, *counts.columns[counts.columns.str.startswith("sub-goal ")]):
+        table[f"{column} % of failures"] = rates(counts[column], counts["failed"])
+    return table.assign(
+        confidence=counts["mean_confidence"].map("{:.2f}".format).replace("nan", "-")
+    )
 
 
 def sub_cases_table(counts: "pd.DataFrame") -> "pd.DataFrame":
     """One row per sub-case that occurred, by case; a column of counts per suite and method."""
-    flat = counts.set_index(BY)[_sub_case_columns()].T
+    flat = counts.set_index(BY)[SUB_CASES].T
     table = flat[flat.sum(axis=1) > 0]
     table.index = table.index.str.split(": ", n=1, expand=True).set_names(["case", "sub-case"])
     return table
@@ -344,65 +304,40 @@ def sub_cases_text(counts: "pd.DataFrame") -> str:
     """How often each sub-case occurred, most frequent first, one line per suite and method."""
     lines = []
     for line in counts.to_dict("records"):
-        occurred = []
-        for name in _sub_case_columns():
-            if line[name]:
-                occurred.append((int(line[name]), name))
-        occurred.sort(reverse=True)
+        occurred = sorted(
+            ((int(line[name]), name) for name in SUB_CASES if line[name]), reverse=True
+        )
         text = ", ".join(f"{n} x {name}" for n, name in occurred)
         lines.append(f"{line['suite']} {line['method']}: {text or 'no failure'}")
     return "\n".join(lines)
 
 
-@value
-class FunnelRow:
-    """How many of `n` episodes are left after each of STAGES.
+def funnel_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One row per suite, method and stage: how many of `n` episodes are left after it.
 
-    None where a method has no such stage. `succeeded` counts every success, also one that failed
-    an earlier stage. `bound` marks a method or policy that reads the simulator.
-    """
-
-    suite: str
-    method: str
-    n: int
-    left: tuple[int | None, ...]
-    succeeded: int
-    bound: bool = False
-
-
-type FunnelTable = list[FunnelRow]
-"""A row per suite and method."""
-
-
-def funnel_table(table: "pd.DataFrame") -> FunnelTable:
-    """How many episodes are left after each stage.
-
-    An episode counts up to the first stage that it does not pass. Methods that ran with several
+    An episode counts up to the first stage that it does not pass; a method lacks the stages that it
+    does not have. The last stage, SR, is every success, also one that failed an earlier stage.
+    `bound` marks a method or policy that reads the simulator. Methods that ran with several
     policies are named as in `breakdown`.
 
     Raises: BadOutput when the table is older than the diagnosis.
     """
-    rows = []
+    import pandas as pd
+
+    lines = []
     for (suite, method), part in _by_policy(diagnosed(table)).groupby(BY, sort=False):
-        left: list[int | None] = []
         passing = part["outcome"].ne("error")
+        bound = bool(len(reads_simulator(part)))
         for stage in STAGES:
             passed = part.get(f"stage_{stage}")
-            if passed is None or passed.isna().all():
-                left.append(None)
-                continue
-            passing &= passed.eq(True)
-            left.append(int(passing.sum()))
-        row = FunnelRow(
-            suite=str(suite),
-            method=str(method),
-            n=len(part),
-            left=tuple(left),
-            succeeded=int(part["outcome"].eq("success").sum()),
-            bound=bool(len(reads_simulator(part))),
-        )
-        rows.append(row)
-    return rows
+            if passed is not None and passed.notna().any():
+                passing &= passed.eq(True)
+                lines.append((suite, method, stage, len(part), int(passing.sum()), bound))
+        succeeded = int(part["outcome"].eq("success").sum())
+        lines.append((suite, method, "SR", len(part), succeeded, bound))
+    found = pd.DataFrame(lines, columns=[*BY, "stage", "n", "left", "bound"])
+    found["stage"] = pd.Categorical(found["stage"], [*STAGES, "SR"])
+    return found.assign(value=found["left"] / found["n"])
 
 
 COLUMNS = {
@@ -462,7 +397,8 @@ def list_failures(
         condition that fits nothing in it.
     """
     manifests, once = _read_once(sources)
-    older = undiagnosed(once)
+    check_diagnosed(once)
+    older = once[once["case"].isna()]  # episodes of runs that are older than the diagnosis
     known = diagnosed(once).reset_index(drop=True)
     all_episodes = with_corrections(_with_folders(known))
     selected = all_episodes
@@ -475,19 +411,23 @@ def list_failures(
     table = _select(table, "sub_case", sub_case)
     if where is not None:
         table = rows_matching(table, where)
+    notes: tuple[str, ...] = ()
+    if len(older):
+        n_failures = int(older["outcome"].eq("failure").sum())
+        notes = (f"{older_text(len(older))}; {n_failures} of them failed.",)
     return Failures(
         manifests=manifests,
         all_episodes=all_episodes,
         episodes=selected,
         table=table.reset_index(drop=True),
-        notes=tuple(_notes_of_older(older)),
+        notes=notes,
     )
 
 
 def failures_text(failures: Failures, limit: int = 20) -> str:
     """How the failures divide, and the first of them, numbered as `recording_of` takes them."""
     counts = breakdown(failures.episodes)
-    parts = [align(breakdown_rows(counts)), sub_cases_text(counts), *failures.notes]
+    parts = [printed(breakdown_table(counts)), sub_cases_text(counts), *failures.notes]
     if failures.table.empty:
         return "\n\n".join([*parts, "no failure is left of what was asked for."])
     shown = failures.table.head(limit)
@@ -539,61 +479,31 @@ def _read_once(sources: Sequence[Path]) -> "tuple[dict[str, dict[str, Any]], pd.
         raise BadOutput(
             f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
         )
-    whole = pd.concat(tables, ignore_index=True)
-    ordered = whole.sort_values("case", key=pd.isna, kind="stable")
-    return manifests, _without_repeated(ordered, manifests)
-
-
-def _without_repeated(
-    table: "pd.DataFrame", manifests: Mapping[str, dict[str, Any]]
-) -> "pd.DataFrame":
-    """Every episode once; those of other scenes or another perception stack are others."""
-    settings = {}
+    whole = pd.concat(tables, ignore_index=True).sort_values("case", key=pd.isna, kind="stable")
+    settings = {}  # episodes of other scenes or another perception stack are others
     for digest, manifest in manifests.items():
         study = manifest["configuration"]
         settings[digest] = f"{scene_of(study)}, {study.get('stack', '')}"
-    names = [name for name in (*KEY, "policy") if name in table]
-    keys = table[names].assign(setting=table["configuration"].map(settings))
-    return table[~keys.duplicated()].reset_index(drop=True)
-
-
-def _notes_of_older(older: "pd.DataFrame") -> list[str]:
-    """A sentence on the episodes of runs that are older than the diagnosis."""
-    if older.empty:
-        return []
-    n_failures = int(older["outcome"].eq("failure").sum())
-    return [f"{older_text(len(older))}; {n_failures} of them failed."]
+    names = [name for name in (*KEY, "policy") if name in whole]
+    keys = whole[names].assign(setting=whole["configuration"].map(settings))
+    return manifests, whole[~keys.duplicated()].reset_index(drop=True)
 
 
 def _with_folders(table: "pd.DataFrame") -> "pd.DataFrame":
     """With the folder of each row's recordings and corrections.
 
-    That is the run's; a published table has one for each of its runs and policies.
+    That is the run's; a published table has one for each of its runs and policies, in one folder
+    for all tables of its file name.
     """
     named = table if "policy" in table else table.assign(policy="unnamed")
     folders = []
-    for row in named[["source", "configuration", "policy"]].itertuples(index=False):
-        folders.append(_artifacts_folder(*row))
+    for source, digest, policy in named[["source", "configuration", "policy"]].values:
+        path = Path(source)
+        if path.suffix == ".parquet":
+            path = ARTIFACTS / f"{path.stem}-diagnosed"
+            path = path / re.sub(UNSAFE, "-", str(digest)) / re.sub(UNSAFE, "-", str(policy))
+        folders.append(str(path))
     return table.assign(folder=folders)
-
-
-def _artifacts_folder(source: str, digest: str, policy: str) -> str:
-    if not _is_published(source):
-        return source
-    return str(_table_folder(source) / _folder_name(digest) / _folder_name(policy))
-
-
-def _is_published(source: str) -> bool:
-    return Path(source).suffix == ".parquet"
-
-
-def _table_folder(source: str) -> Path:
-    """What the folders of a published table lie in; tables of one file name share it."""
-    return ARTIFACTS / f"{Path(source).stem}-diagnosed"
-
-
-def _folder_name(label: object) -> str:
-    return re.sub(UNSAFE, "-", str(label))
 
 
 def _select(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
@@ -611,22 +521,15 @@ def _select(table: "pd.DataFrame", column: str, wanted: Any) -> "pd.DataFrame":
 
 def _listing(shown: "pd.DataFrame") -> str:
     """A numbered line per failure; corrected ones have a star."""
-    columns = dict(COLUMNS)
-    if SUBGOAL not in shown or shown[SUBGOAL].isna().all():
-        del columns[SUBGOAL]
-    rows: list[Sequence[str]] = [["#", *columns.values()]]
-    for i, line in enumerate(shown.to_dict("records")):
-        number = f"{i}*" if line["corrected"] else str(i)
-        rows.append([number, *(_cell(name, line[name]) for name in columns)])
-    return align(rows)
-
-
-def _cell(name: str, cell: Any) -> str:
-    if name == SUBGOAL:
-        return "-" if cell != cell else str(int(cell))
-    if isinstance(cell, float):
-        return f"{cell:.2f}"
-    return str(cell)
+    columns = [name for name in COLUMNS if name in shown and shown[name].notna().any()]
+    listed = shown[columns].rename(columns=COLUMNS)
+    if SUBGOAL in columns:
+        listed[COLUMNS[SUBGOAL]] = listed[COLUMNS[SUBGOAL]].astype("Int64").astype(object)
+    marks = [f"{i}*" if star else str(i) for i, star in enumerate(shown["corrected"])]
+    listed.insert(0, "#", marks)
+    if "confidence" in listed:
+        listed["confidence"] = listed["confidence"].map("{:.2f}".format)
+    return printed(listed)
 
 
 def recording_of(failures: Failures, number: int) -> Path:
@@ -649,7 +552,10 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     from vap_core.recording import combine_recordings
 
     row = failure_row(failures, number)
-    same = _in_scene_of(row, failures)
+    digests = failures.manifests.items()
+    scenes = {digest: scene_of(manifest["configuration"]) for digest, manifest in digests}
+    same = failures.all_episodes
+    same = same[same["configuration"].map(scenes) == scenes[row["configuration"]]]
     for name in (*ROW_KEY, "policy"):
         same = same[same[name] == row[name]]
     if method == row["method"]:
@@ -674,15 +580,6 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     return out
 
 
-def _in_scene_of(row: Mapping[str, Any], failures: Failures) -> "pd.DataFrame":
-    """The episodes of runs with the robots and the object of a row's."""
-    scenes = {}
-    for digest, manifest in failures.manifests.items():
-        scenes[digest] = scene_of(manifest["configuration"])
-    table = failures.all_episodes
-    return table[table["configuration"].map(scenes) == scenes[row["configuration"]]]
-
-
 def recording_to_show(
     failures: Failures, number: int, against: str | None = None
 ) -> tuple[Path, int]:
@@ -692,11 +589,15 @@ def recording_to_show(
 
     Raises: as `side_by_side_recording`.
     """
+    from vap_core.recording import read_summary
+
     together = None
     if against is not None:  # a wrong name is said before anything is run
         together = side_by_side_recording(failures, number, against)
     single = recording_of(failures, number)
-    return together or single, _opening_frame(failures, number, single)
+    # An episode that was run again may end a little otherwise than the table says.
+    frame = int(read_summary(single).get("deciding_frame", -1))
+    return together or single, frame if frame >= 0 else deciding_frame(failures, number)
 
 
 def save_screenshot(failures: Failures, number: int, png: Path, against: str | None = None) -> str:
@@ -714,18 +615,6 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     row = failure_row(failures, number)
     write_provenance(png, study_of(failures.manifests[row["configuration"]], row))
     return str(row["case_sentence"])
-
-
-def _opening_frame(failures: Failures, number: int, recording: Path) -> int:
-    """The frame that decided a recorded failure.
-
-    An episode that was run again may end a little otherwise than the table says: its own recording
-    goes first.
-    """
-    from vap_core.recording import read_summary
-
-    frame = int(read_summary(recording).get("deciding_frame", -1))
-    return frame if frame >= 0 else deciding_frame(failures, number)
 
 
 def correct_failure(failures: Failures, number: int, case: str, note: str = "") -> Path:

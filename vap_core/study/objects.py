@@ -10,18 +10,19 @@ objects, as `objects import --out` writes them.
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from vap_core import __version__
 from vap_core.attend import Attender
 from vap_core.base.errors import BadObject, BadStudy, command
-from vap_core.base.files import Rows, align, read_rows, write_atomic, writing
+from vap_core.base.files import read_rows
 from vap_core.base.media import load_photo
 from vap_core.base.types import Grounding, Rgb, value
 from vap_core.memory import kind_instead
@@ -33,7 +34,8 @@ from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.assets.scans import import_scan, storage
 from vap_core.simulation.types import EpisodeRow
-from vap_core.study import engine, store
+from vap_core.study import engine, measurement
+from vap_core.study.measurement import Measurement, Row, Tables
 from vap_core.study.perception import (
     SAME_BOX,
     USUAL_K,
@@ -43,7 +45,6 @@ from vap_core.study.perception import (
     opening_views,
     registered_object,
 )
-from vap_core.study.processes import results_here
 from vap_core.study.register import (
     RIGHT,
     SILENT,
@@ -55,13 +56,14 @@ from vap_core.study.register import (
     labelled,
     write_picture,
 )
-from vap_core.study.stats import clustered_share
+from vap_core.study.stats import share_by
+from vap_core.study.table import printed
 from vap_core.study.trials import Study, default_policy, feasible
+from vap_core.study.workers import results_here
 from vap_core.vote import nominate
 
 if TYPE_CHECKING:
     import pandas as pd
-    from tqdm import tqdm
 
 TABLE = "objects.csv"
 COLUMNS = ("file", "category", "height_cm", "groups")
@@ -99,7 +101,12 @@ def read_source(folder: Path) -> Source:
         name = import_scan.default_name(path)
         if name in groups:
             raise BadObject(f"measure objects: {where} names a second {name!r}; rename the file.")
-        _check_category(row["category"], where)
+        kind = kind_instead(row["category"])
+        if kind:
+            raise BadObject(
+                f"measure objects: {where} has the category {row['category']!r}; name the kind of "
+                f"thing alone, in words, for example {kind}."
+            )
         _check_height(row["height_cm"], where)
         groups[name] = tuple(word for word in map(str.strip, row["groups"].split(";")) if word)
         files[name] = row
@@ -109,9 +116,7 @@ def read_source(folder: Path) -> Source:
     return Source(groups=groups, files=files, sha256=digest.hexdigest())
 
 
-def import_missing(
-    source: Source, folder: Path, target: Path, report: Callable[[str], None]
-) -> dict[str, str]:
+def import_missing(source: Source, folder: Path, target: Path) -> dict[str, str]:
     """Import the files of a source that `target` lacks; why others cannot be, by name.
 
     Some ten seconds of CPU an object.
@@ -122,7 +127,6 @@ def import_missing(
     for name, row in source.files.items():
         if (target / name / storage.METADATA_FILE).exists():
             continue
-        report(f"importing {name}")
         height_cm = float(row["height_cm"]) if row["height_cm"] else None
         try:
             metadata, scan = import_scan.import_scan(
@@ -180,15 +184,6 @@ def _imported(folder: Path) -> Source:
     return Source(groups=groups, files={}, sha256=digest.hexdigest())
 
 
-def _check_category(text: str, where: str) -> None:
-    kind = kind_instead(text)
-    if kind:
-        raise BadObject(
-            f"measure objects: {where} has the category {text!r}; name the kind of thing alone, in "
-            f"words, for example {kind}."
-        )
-
-
 def _check_height(text: str, where: str) -> None:
     if not text:
         return
@@ -203,7 +198,6 @@ def _check_height(text: str, where: str) -> None:
         )
 
 
-Row = dict[str, Any]
 TILE_PX = 224
 
 
@@ -240,12 +234,13 @@ def _view_row(view: View, offered: Proposals, grounding: Grounding) -> Row:
         "proposed": None,
         "right": None,
         "tinted": grounding.winner is not None,
-        "elected": _elected(view, grounding),
+        "elected": "",
         "likeness": None,
         "mask_iou": None,
     }
     chosen = grounding.chosen
     if chosen is not None:
+        row["elected"] = object_under_box(view, grounding.candidates.xyxy[chosen])
         row["likeness"] = float(grounding.likeness[chosen])
     if not row["counts"]:
         return row
@@ -256,13 +251,6 @@ def _view_row(view: View, offered: Proposals, grounding: Grounding) -> Row:
     if row["right"] and chosen is not None:
         row["mask_iou"] = mask_iou(grounding.masks[chosen], view.masks[target])
     return row
-
-
-def _elected(view: View, grounding: Grounding) -> str:
-    """The object under the elected box; "" where there is none."""
-    if grounding.chosen is None:
-        return ""
-    return object_under_box(view, grounding.candidates.xyxy[grounding.chosen])
 
 
 def _tile(view: View, grounding: Grounding, row: Row) -> Rgb:
@@ -296,64 +284,92 @@ NOTE = (
 )
 
 
-@value
-class Tables:
-    """A row per view and per episode, the groups of every object, and why some were left out."""
-
-    views: "pd.DataFrame"
-    episodes: "pd.DataFrame"
-    groups: Mapping[str, tuple[str, ...]]
-    refused: Mapping[str, str]
-
-
-def text_report(tables: Tables) -> str:
-    """What the command prints."""
+def text_report(tables: "Mapping[str, pd.DataFrame]", groups: Mapping[str, Sequence[str]]) -> str:
+    """What the command prints; `groups` are the words of each object."""
     parts = []
-    if len(tables.views):
-        parts += [align(object_rows(tables)), align(group_rows(tables))]
-    if tables.refused:
-        lines = [f"left out: {name}: {why}" for name, why in tables.refused.items()]
-        parts.append("\n".join(lines))
-    if len(tables.views):
-        parts.append(NOTE)
-    return "\n\n".join(parts)
+    if len(tables["views"]):
+        parts += [printed(object_table(tables)), printed(group_table(tables, groups))]
+    left_out = [f"left out: {row.object}: {row.why}" for row in tables["refused"].itertuples()]
+    parts += ["\n".join(left_out)] if left_out else []
+    return "\n\n".join([*parts, NOTE] if len(tables["views"]) else parts)
 
 
-def object_rows(tables: Tables) -> Rows:
+def _judged(views: "pd.DataFrame") -> "pd.DataFrame":
+    """What became of the views; of those that count, and of the right ones, nothing of others."""
+    seen = views.counts.astype(bool)
+    right = views.right.astype("boolean").fillna(False).astype(bool)
+    wrong = views.tinted.astype(bool) & (views.elected != views.target)
+    proposed = views.proposed.astype("boolean").fillna(False).astype(bool)
+    return views.assign(
+        **{
+            "views": seen,
+            "proposed": proposed.where(seen),
+            "right": right.where(seen),
+            "not in view": (~views.tinted.astype(bool)).where(seen & right),
+            "wrong tint": wrong,
+        }
+    )
+
+
+def _mean(values: "pd.Series") -> str:
+    known = values.dropna()
+    return f"{known.mean():.2f}" if len(known) else "-"
+
+
+def object_table(tables: "Mapping[str, pd.DataFrame]") -> "pd.DataFrame":
     """One line per object: counts."""
-    head = ["object", "views", "proposed", "right", "not in view", "wrong tint", "mask IoU"]
-    rows = [[*head, "expert", "VAP"]]
-    for name, part in tables.views.groupby("target", sort=True):
-        seen = part[part.counts]
-        wrong = part.tinted & (part.elected != part.target)
-        right = _right(seen)
-        refused = ~right.tinted
-        counts = [len(seen), seen.proposed.sum(), len(right), refused.sum(), wrong.sum()]
-        cells = [str(name), *(str(int(count)) for count in counts), _mean(seen.mask_iou)]
-        if len(tables.episodes):
-            of_object = tables.episodes[tables.episodes.object == name]
+    import pandas as pd
+
+    lines = []
+    episodes = tables["episodes"]
+    for name, part in _judged(tables["views"]).groupby("target", sort=True):
+        line: dict[str, Any] = {"object": name}
+        for column in ("views", "proposed", "right", "not in view", "wrong tint"):
+            line[column] = int(part[column].dropna().astype(bool).sum())
+        line |= {"mask IoU": _mean(part[part.views].mask_iou), "expert": "-", "VAP": "-"}
+        if len(episodes):
+            of_object = episodes[episodes.object == name]
             can = of_object[of_object.expert]
-            cells += [f"{len(can)} of {len(of_object)}", f"{int(can.success.sum())} of {len(can)}"]
-        else:
-            cells += ["-", "-"]
-        rows.append(cells)
-    return rows
+            line["expert"] = f"{len(can)} of {len(of_object)}"
+            line["VAP"] = f"{int(can.success.sum())} of {len(can)}"
+        lines.append(line)
+    return pd.DataFrame(lines)
 
 
-def group_rows(tables: Tables) -> Rows:
+def group_table(
+    tables: "Mapping[str, pd.DataFrame]", groups: Mapping[str, Sequence[str]]
+) -> "pd.DataFrame":
     """All objects, by camera, and by group: shares."""
-    head = ["", "proposed", "right", "not in view", "wrong tint", "mask IoU"]
-    rows = [
-        [*head, "expert", "VAP", "touches first"],
-        _shares("all", tables, tables.groups),
-    ]
-    for camera, part in tables.views.groupby("camera", sort=True):
-        cells = _view_cells(part)
-        rows.append([f"- {camera} views", *cells, "", "", ""])
-    for group in sorted({word for words in tables.groups.values() for word in words}):
-        members = [name for name, words in tables.groups.items() if group in words]
-        rows.append(_shares(f"- {group}", tables, members))
-    return rows
+    import pandas as pd
+
+    views, episodes = _judged(tables["views"]), tables["episodes"]
+    members = {"all": list(groups)}
+    cameras = sorted(views.camera.unique())
+    for group in sorted({word for words in groups.values() for word in words}):
+        members[f"- {group}"] = [name for name, words in groups.items() if group in words]
+    parts = [("all", views)]
+    parts += [(f"- {camera} views", views[views.camera == camera]) for camera in cameras]
+    parts += [(title, views[views.target.isin(members[title])]) for title in list(members)[1:]]
+    lines = []
+    for title, part in parts:
+        line = {"": title}
+        for column in ("proposed", "right", "not in view", "wrong tint"):
+            line[column] = share_by(part, column, ["target"]).text(digits=0)
+        line["mask IoU"] = _mean(part[part.views].mask_iou)
+        blank = "" if title not in members else "-"
+        line |= dict.fromkeys(("expert", "VAP", "touches first"), blank)
+        if title in members and len(episodes):
+            played = episodes[episodes.object.isin(members[title])]
+            played = played.assign(
+                VAP=played.success.where(played.expert),
+                first=played.first_object_correct.astype("boolean")
+                .fillna(False)
+                .where(played.expert),
+            )
+            for column, name in (("expert", "expert"), ("VAP", "VAP"), ("first", "touches first")):
+                line[name] = share_by(played, column, ["object"]).text(digits=0)
+        lines.append(line)
+    return pd.DataFrame(lines)
 
 
 def write_sheets(out: Path) -> list[Path]:
@@ -373,69 +389,91 @@ def write_sheets(out: Path) -> list[Path]:
     return paths
 
 
-def _shares(title: str, tables: Tables, members: Iterable[str]) -> list[str]:
-    names = list(members)
-    cells = _view_cells(tables.views[tables.views.target.isin(names)])
-    if not len(tables.episodes):
-        return [title, *cells, "-", "-", "-"]
-    part = tables.episodes[tables.episodes.object.isin(names)]
-    can = part[part.expert]
-    return [
-        title,
-        *cells,
-        _share(part.expert, part.object),
-        _share(can.success, can.object),
-        _share(can.first_object_correct, can.object),
-    ]
-
-
-def _view_cells(part: "pd.DataFrame") -> list[str]:
-    seen = part[part.counts]
-    right = _right(seen)
-    wrong = part.tinted & (part.elected != part.target)
-    return [
-        _share(seen.proposed, seen.target),
-        _share(seen.right, seen.target),
-        _share(~right.tinted, right.target),
-        _share(wrong, part.target),
-        _mean(seen.mask_iou),
-    ]
-
-
-def _right(seen: "pd.DataFrame") -> "pd.DataFrame":
-    """The views in which the object is elected, tinted or not."""
-    return seen[seen.right.astype("boolean").fillna(False).astype(bool)]
-
-
-def _share(hits: "pd.Series", clusters: "pd.Series") -> str:
-    """The share of hits with its interval, objects as clusters."""
-    known = hits.astype("boolean").fillna(False).to_numpy(float)
-    return clustered_share(known, clusters).text(digits=0)
-
-
-def _mean(values: "pd.Series") -> str:
-    known = values.dropna().to_numpy(np.float64)
-    if not len(known):
-        return "-"
-    return f"{known.mean():.2f}"
-
-
-CALLER = "measure objects"
 METHOD = "vap"
 
 
-@value
-class ObjectSurvey:
+@dataclass(frozen=True)
+class Job:
+    """One object."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class ObjectMeasurement(Measurement):
     """What is asked for: `episodes` of every task that fits, spread over its list.
 
     `policy` "" takes the shipped one of the suites; `views_only` runs no episodes.
     """
 
+    folder: Path
     suites: tuple[str, ...] = ("tabletop",)
     episodes: int = 4
     stack: str = "embedded"
     policy: str = ""
     views_only: bool = False
+    caller: ClassVar[str] = "measure objects"
+
+    def settings(self) -> dict[str, Any]:
+        """Raises: BadObject; UnknownName; MissingWeights."""
+        check_stack(self.stack, self.caller)
+        about = asdict(self) | {"suites": list(self.suites)}
+        del about["folder"]
+        lists = {name: suites.digest(name) for name in self.suites if suites.has_list(name)}
+        return {
+            "measurement": "objects",
+            "objects": read_source(self.folder).sha256,
+            **about,
+            "lists": lists,
+            "version": __version__,
+            **checksums(self.stack),
+        }
+
+    def jobs(self) -> list[Job]:
+        return [Job(name) for name in read_source(self.folder).groups]
+
+    def shelf(self, out: Path) -> Path:
+        """Where the objects are."""
+        return out / "objects" if read_source(self.folder).files else self.folder
+
+    def prepare(self, folder: Path) -> None:
+        """Import what is not there; jobs whose object cannot be say why."""
+        source = read_source(self.folder)
+        refused = import_missing(source, self.folder, self.shelf(folder))
+        for name, why in refused.items():
+            part = measurement.Part(self, Job(name), folder)
+            tables: Tables = {
+                "views": [],
+                "episodes": [],
+                "refused": [{"object": name, "why": why}],
+            }
+            measurement.store.write_json_part(part.path, tables, self.caller)
+
+    def run(self, job: Job, folder: Path) -> Tables:
+        """The rows of the opening views, and of each episode with whether the expert can do it; or
+        why the object cannot be measured."""
+        tables: Tables = {"views": [], "episodes": [], "refused": []}
+        try:
+            tasks = suites.tasks_of(self.suites, job.name)
+            if not tasks:
+                kind = get_object(job.name).category
+                raise BadObject(f"no task of {', '.join(self.suites)} asks for a {kind}")
+            for suite, task in tasks:
+                study = self.study(suite, task, job.name)
+                slug = f"{job.name}.{suite}.{task}"
+                rows = study.rows(suite, task)
+                seen, picture = measure_openings(rows, _load_stack(self.stack))
+                write_picture(folder / "parts" / f"{slug}.png", picture)
+                tables["views"] += seen
+                if not self.views_only:
+                    tables["episodes"] += self.played(study, rows, folder / "episodes" / slug)
+        except (BadObject, BadStudy) as error:
+            return {
+                "views": [],
+                "episodes": [],
+                "refused": [{"object": job.name, "why": str(error)}],
+            }
+        return tables
 
     def study(self, suite: str, task: str, name: str) -> Study:
         """The study of one task with an object in its target's place. Raises: as `Study`."""
@@ -449,137 +487,36 @@ class ObjectSurvey:
             object=name,
         )
 
+    def played(self, study: Study, rows: Sequence[EpisodeRow], folder: Path) -> list[Row]:
+        """What became of each episode, and whether the expert can do it."""
+        can = {row.episode: good for row, good in zip(rows, feasible(rows), strict=True)}
+        # In this process, models and policy are loaded once for all objects.
+        here: dict[str, Any] = dict(workers=1, executor=results_here)
+        table = engine.run(study, folder, record="none", progress=False, **here)
+        return [
+            {**row, "object": study.object, "expert": can[row["episode"]]}
+            for row in table.to_dict("records")
+        ]
 
-def measure_objects(folder: Path, out: Path, asked: ObjectSurvey) -> str:
+
+_load_stack = cache(load_stack)
+
+
+def measure_objects(asked: ObjectMeasurement, out: Path) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
     Raises: BadObject, also where every object was left out; UnknownName; MissingWeights; BadOutput
         when `out` holds another run.
     """
-    from tqdm import tqdm
-
-    check_stack(asked.stack, CALLER)
-    source = read_source(folder)
-    store.open_run(out, _configuration(source, asked))
-    shelf = out / "objects" if source.files else folder
-    with store.locked(out), objects_in(shelf):
-        with tqdm(total=len(source.groups), unit="object") as bar:
-            refused = import_missing(source, folder, shelf, bar.set_postfix_str)
-            views, episodes = _measure(source, out, asked, refused, bar)
-        tables = Tables(views=views, episodes=episodes, groups=source.groups, refused=refused)
-        written = _write(tables, out)
-        report = text_report(tables)
-        with writing(out, CALLER):
-            write_atomic(out / "report.txt", f"{report}\n".encode())
-        if not len(views):
-            raise _nothing_measured(refused, out)
-    names = ", ".join(map(str, [*written, *write_sheets(out)]))
-    return f"{report}\n\nwrote {names}"
-
-
-def _nothing_measured(refused: Mapping[str, str], out: Path) -> BadObject:
-    """Why the first object was left out, and where the report has the others."""
-    name, why = next(iter(refused.items()))
-    others = ""
-    if len(refused) > 1:
-        others = f" report.txt in {out.name} says why of {len(refused) - 1} more."
-    return BadObject(f"measure objects: every object was left out. {name}: {why}{others}")
-
-
-def _configuration(source: Source, asked: ObjectSurvey) -> dict[str, Any]:
-    """What the results depend on."""
-    lists = {name: suites.digest(name) for name in asked.suites if suites.has_list(name)}
-    return {
-        "measurement": "objects",
-        "objects": source.sha256,
-        **asdict(asked),
-        "suites": list(asked.suites),
-        "lists": lists,
-        "version": __version__,
-        **checksums(asked.stack),
-    }
-
-
-def _measure(
-    source: Source, out: Path, asked: ObjectSurvey, refused: dict[str, str], bar: "tqdm"
-) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """A row per view, and a row per episode. Objects that cannot be measured go to `refused`."""
-    import pandas as pd
-
-    stack = load_stack(asked.stack)
-    views: list[Row] = []
-    episodes: list[Row] = []
-    for name in source.groups:
-        bar.set_postfix_str(name)
-        if name not in refused:
-            seen: list[Row] = []
-            played: list[Row] = []
-            try:
-                for suite, task in _tasks(name, asked.suites):
-                    study = asked.study(suite, task, name)
-                    seen += _views(study, out, stack)
-                    if not asked.views_only:
-                        played += _episodes(study, out)
-                views += seen
-                episodes += played
-            except (BadObject, BadStudy) as error:
-                refused[name] = str(error)
-        bar.update()
-    return pd.DataFrame(views), pd.DataFrame(episodes)
-
-
-def _tasks(name: str, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """The tasks for an object of its category. Raises: BadObject where there is none."""
-    found = suites.tasks_of(names, name)
-    if not found:
-        raise BadObject(f"no task of {', '.join(names)} asks for a {get_object(name).category}")
-    return found
-
-
-def _views(study: Study, out: Path, stack: Any) -> list[Row]:
-    """The rows of the opening views, measured or read again."""
-    path = out / "parts" / f"{_slug(study)}.views.json"
-    if not path.exists():
-        (task,) = study.tasks
-        table, picture = measure_openings(study.rows(*task), stack)
-        write_picture(path.with_name(f"{_slug(study)}.png"), picture)
-        store.write_json_part(path, table, caller=CALLER)
-    rows: list[Row] = store.read_json_part(path, caller=CALLER)
-    return rows
-
-
-def _episodes(study: Study, out: Path) -> list[Row]:
-    """What became of each episode, and whether the expert can do it."""
-    path = out / "parts" / f"{_slug(study)}.expert.json"
-    (task,) = study.tasks
-    rows = study.rows(*task)
-    if not path.exists():
-        store.write_json_part(path, list(feasible(rows)), caller=CALLER)
-    expert = store.read_json_part(path, caller=CALLER)
-    can = {row.episode: good for row, good in zip(rows, expert, strict=True)}
-    # In this process, models and policy are loaded once for all objects.
-    table = engine.run(
-        study,
-        out / "episodes" / _slug(study),
-        workers=1,
-        record="none",
-        progress=False,
-        executor=results_here,
-    )
-    found: list[Row] = []
-    for row in table.to_dict("records"):
-        found.append({**row, "object": study.object, "expert": can[row["episode"]]})
-    return found
-
-
-def _slug(study: Study) -> str:
-    ((suite, task),) = study.tasks
-    return f"{study.object}.{suite}.{task}"
-
-
-def _write(tables: Tables, out: Path) -> list[Path]:
-    paths = []
-    for name, table in (("views", tables.views), ("episodes", tables.episodes)):
-        if len(table):
-            paths += store.write_table(table, out, name)
-    return paths
+    source = read_source(asked.folder)
+    with objects_in(asked.shelf(out)):
+        tables = measurement.measure(asked, out)
+        report = measurement.report(asked, text_report(tables, source.groups), out)
+    if not len(tables["views"]):
+        first, *more = tables["refused"].itertuples()
+        others = f" report.txt in {out.name} says why of {len(more)} more." if more else ""
+        raise BadObject(
+            f"measure objects: every object was left out. {first.object}: {first.why}{others}"
+        )
+    write_sheets(out)
+    return report

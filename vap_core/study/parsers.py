@@ -8,8 +8,8 @@ and then looked at; "test" is held out.
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cache
 from hashlib import sha256
@@ -18,17 +18,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.base.errors import BadEndpoint, VapError
-from vap_core.base.files import DATA, Rows, align, code_version
+from vap_core.base.errors import BadEndpoint, BadStudy, VapError, one_of
+from vap_core.base.files import DATA, code_version
 from vap_core.base.types import Description, Instruction, PersonalObject, value
 from vap_core.instruction import Parser
 from vap_core.instruction.context import Context, Use
+from vap_core.instruction.parsers import load_parser
 from vap_core.memory import recall
-from vap_core.study.stats import bootstrap_interval, rate
+from vap_core.study import charts
+from vap_core.study.measurement import Row
+from vap_core.study.stats import resampled_mean, share
 from vap_core.study.store import encode_table, publish_tables
+from vap_core.study.table import printed
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 FOLDER = DATA / "paraphrases"
 KINDS = ("explicit", "implicit", "negated", "owner", "history", "none")
@@ -223,53 +228,49 @@ def _object(key: str, place: str, owner: str) -> PersonalObject:
     )
 
 
-@value
-class Answer:
-    """What a parser makes of one paraphrase.
+@dataclass(frozen=True)
+class ParserMeasurement:
+    """The answers of parsers to every paraphrase; to the first `limit` of a suite and part.
 
-    `found` are the names of the objects that it finds, with commas; "" where it abstains, and
-    `error` says why. `right` says whether that is the object that is meant, or whether it abstains
-    where none is. `kept` says whether the expression begins where it should and leaves the rest of
-    the command.
+    A parser is a name that `load_parser` knows.
+
+    Raises: UnknownName for a suite or a part that there is not; BadStudy for no parser.
     """
 
-    parser: str
-    suite: str
-    part: str
-    kind: str
-    family: str
-    text: str
-    meant: str
-    found: str
-    right: bool
-    kept: bool
-    error: str
+    parsers: tuple[str, ...] = ("rule", "embedding")
+    suites: tuple[str, ...] = ()
+    parts: tuple[str, ...] = PARTS
+    limit: int | None = None
 
+    def __post_init__(self) -> None:
+        if not self.parsers:
+            raise BadStudy(
+                "measure parsers: no parser is named; name one, or leave the option out for the "
+                "default, rule,embedding."
+            )
+        for what, given, known in (
+            ("suite", self.suites, suite_names()),
+            ("part", self.parts, PARTS),
+        ):
+            for name in given:
+                if name not in known:
+                    raise one_of(f"measure parsers: {what}", name, known)
 
-def measure(
-    name: str,
-    load: Callable[[Context], Parser],
-    suites: Sequence[str],
-    parts: Sequence[str],
-    limit: int | None = None,
-) -> list[Answer]:
-    """The answers of a parser to every paraphrase; to the first `limit` of a suite and part.
+    def rows(self) -> list[Row]:
+        """A row per parser and paraphrase: `found` are the names of the objects that it finds, with
+        commas; "" where it abstains, and `error` says why. `right` says whether that is the object
+        that is meant, or whether it abstains where none is. `kept` says whether the expression
+        begins where it should and leaves the rest of the command.
 
-    Raises: BadEndpoint: the parser's server fails, which is no abstention.
-    """
-    answers = []
-    for suite in suites:
-        for part in parts:
-            for paraphrase in paraphrases(suite, part)[:limit]:
-                answers.append(_answer(name, load(paraphrase.context), paraphrase))
-    return answers
-
-
-def answer_table(answers: Sequence[Answer]) -> "pd.DataFrame":
-    """One row an answer."""
-    import pandas as pd
-
-    return pd.DataFrame([asdict(answer) for answer in answers])
+        Raises: BadEndpoint: a parser's server fails, which is no abstention.
+        """
+        return [
+            _answer(name, load_parser(name, paraphrase.context), paraphrase)
+            for name in self.parsers
+            for suite in self.suites or suite_names()
+            for part in self.parts
+            for paraphrase in paraphrases(suite, part)[: self.limit]
+        ]
 
 
 def paraphrase_digest() -> str:
@@ -280,7 +281,7 @@ def paraphrase_digest() -> str:
     return found.hexdigest()[:16]
 
 
-def _answer(name: str, parser: Parser, paraphrase: Paraphrase) -> Answer:
+def _answer(name: str, parser: Parser, paraphrase: Paraphrase) -> Row:
     context = paraphrase.context
     categories = {obj.category for obj in context.objects.values()}
     found: list[str] = []
@@ -288,28 +289,22 @@ def _answer(name: str, parser: Parser, paraphrase: Paraphrase) -> Answer:
     kept = True
     try:
         parsed = parser(paraphrase.text, categories)
-        for target in parsed.targets:
-            found.append(recall(context.objects, target, speaker=context.speaker).name)
+        found = [
+            recall(context.objects, target, speaker=context.speaker).name
+            for target in parsed.targets
+        ]
         kept = _keeps(parsed, paraphrase)
     except BadEndpoint:
         raise
     except VapError as problem:
         error = str(problem)
         found = []
-    meant = [] if paraphrase.object is None else [paraphrase.object]
-    return Answer(
-        parser=name,
-        suite=paraphrase.suite,
-        part=paraphrase.part,
-        kind=paraphrase.kind,
-        family=paraphrase.family,
-        text=paraphrase.text,
-        meant=paraphrase.object or "",
-        found=",".join(found),
-        right=found == meant,
-        kept=kept,
-        error=error,
-    )
+    meant = paraphrase.object or ""
+    about = {
+        name: getattr(paraphrase, name) for name in ("suite", "part", "kind", "family", "text")
+    }
+    answer = {"meant": meant, "found": ",".join(found), "right": found == [meant][: bool(meant)]}
+    return {"parser": name, **about, **answer, "kept": kept, "error": error}
 
 
 def _keeps(parsed: Instruction, paraphrase: Paraphrase) -> bool:
@@ -320,29 +315,60 @@ def _keeps(parsed: Instruction, paraphrase: Paraphrase) -> bool:
 
 TABLE = "parsers.parquet"
 ALL = "all"
+NOTE = (
+    "right: the object that is meant is found, or none where none is meant; [95 %: Wilson; "
+    "families resampled]. wrong object: another is found. kept: of those right, the rewrite "
+    "keeps the rest of the command."
+)
 
 
-def text(table: "pd.DataFrame") -> str:
-    """Accuracy by parser, part and kind, and what happens where no personal object is meant."""
-    notes = (
-        "right: the object that is meant is found, or none where none is meant; [95 %: Wilson; "
-        "families resampled]. wrong object: another is found. kept: of those right, the rewrite "
-        "keeps the rest of the command."
-    )
-    return f"{align(rows(table))}\n{notes}"
+def accuracy(answers: "pd.DataFrame") -> "pd.DataFrame":
+    """A line per parser, part and kind: how often it is `right` (with Wilson's interval; `low` and
+    `high` resample whole template families), abstains, finds a wrong object, and, of those right,
+    keeps the rest of the command.
+    """
+    import pandas as pd
 
-
-def rows(table: "pd.DataFrame") -> Rows:
-    """A line per parser, part and kind; the header first."""
-    lines = [
-        ["parser", "part", "kind", "families", "n", "right", "abstains", "wrong object", "kept"]
-    ]
-    for (parser, part), group in table.groupby(["parser", "part"], sort=False):
+    lines = []
+    for (parser, part), group in answers.groupby(["parser", "part"], sort=False):
         for kind in (*KINDS, ALL):
-            of_kind = group if kind == ALL else group[group["kind"] == kind]
-            if len(of_kind):
-                lines.append([str(parser), str(part), kind, *_cells(of_kind)])
-    return lines
+            rows = group if kind == ALL else group[group["kind"] == kind]
+            if rows.empty:
+                continue
+            silent, right = rows["found"] == "", rows["right"].astype(bool)
+            families = right.groupby(rows["family"]).agg(["sum", "size"])
+            over = resampled_mean(families, least=0.0)
+            line = dict(parser=parser, part=part, kind=kind, families=len(families), n=len(rows))
+            line |= dict(right=share(right), abstains=share(silent))
+            line["wrong object"] = share(~silent & ~right)
+            line["kept"] = share(rows["kept"][right & ~silent])
+            lines.append({**line, "low": max(over.low, 0.0), "high": min(over.high, 1.0)})
+    return pd.DataFrame(lines)
+
+
+def text(answers: "pd.DataFrame") -> str:
+    """Accuracy by parser, part and kind, and what happens where no personal object is meant."""
+    found = accuracy(answers)
+    shown = found.drop(columns=["low", "high"])
+    ends = zip(found["right"], found["low"], found["high"], strict=True)
+    shown["right"] = [f"{right} [{100 * low:.0f}, {100 * high:.0f}]" for right, low, high in ends]
+    for name in ("abstains", "wrong object", "kept"):
+        shown[name] = ["-" if not each.n else f"{100 * each.value:.0f} %" for each in found[name]]
+    return f"{printed(shown)}\n{NOTE}"
+
+
+def accuracy_figure(found: "pd.DataFrame", theirs: "pd.Series[float]", title: str) -> "Figure":
+    """Accuracy of every parser by kind, 95 % over families; `theirs` are the paper's of implicit
+    instructions by task, in %, drawn at their mean.
+    """
+    shown = found.assign(value=[each.value for each in found["right"]], paper=float("nan"))
+    shown.loc[shown["kind"] == "implicit", "paper"] = theirs.mean() / 100
+    shown["kind"] += ", n " + shown["n"].astype(str)
+    label = (
+        "% of held-out sentences that are understood, 95 % interval over families\n"
+        f"diamond: the paper's GPT-4o-mini, {theirs.min()} to {theirs.max()} by task"
+    )
+    return charts.dots(shown, "kind", series="parser", label=label, title=title)
 
 
 def publish(table: "pd.DataFrame", to: Path) -> list[Path]:
@@ -354,23 +380,3 @@ def publish(table: "pd.DataFrame", to: Path) -> list[Path]:
     metadata = {**(arrow.schema.metadata or {}), b"about": json.dumps(about).encode()}
     data = encode_table(arrow.replace_schema_metadata(metadata))
     return publish_tables({TABLE: data}, to, "measure parsers")
-
-
-def _cells(group: "pd.DataFrame") -> list[str]:
-    families = group.groupby("family")["right"].agg(["sum", "count"])
-    gain = families["sum"].to_numpy(float)
-    n = families["count"].to_numpy(float)
-    low, high = bootstrap_interval(gain, n, least=0.0)
-    right = rate(int(group["right"].sum()), len(group))
-    silent = group["found"] == ""
-    wrong = ~silent & ~group["right"]
-    kept = group[group["right"] & ~silent]["kept"]
-    whole = np.round(100 * np.clip([low, high], 0, 1)).astype(int)
-    return [
-        str(len(families)),
-        str(len(group)),
-        f"{right} [{whole[0]}, {whole[1]}]",
-        f"{100 * silent.mean():.0f} %",
-        f"{100 * wrong.mean():.0f} %",
-        f"{100 * kept.mean():.0f} %" if len(kept) else "-",
-    ]

@@ -14,23 +14,24 @@ references is a rival: it is never asked for. Several rows of one scene and obje
 
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64
 
 from vap_core import __version__
 from vap_core.attend import Attender
 from vap_core.base.errors import BadPhoto, BadPhotoSet
-from vap_core.base.files import Rows, align, read_rows, write_atomic, writing
+from vap_core.base.files import read_rows
 from vap_core.base.media import load_mask, load_photo, photos_in
-from vap_core.base.types import Boxes, Grounding, Mask, PersonalObject, Rgb, value
+from vap_core.base.types import Boxes, Mask, PersonalObject, Rgb, value
 from vap_core.memory import (
     NAME,
     NAME_RULE,
@@ -44,7 +45,8 @@ from vap_core.perception.boxes import box_iou, mask_iou
 from vap_core.perception.candidates import Candidates, Proposals, embed, prove, segment
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
-from vap_core.study import store
+from vap_core.study import measurement
+from vap_core.study.measurement import Measurement, Row, Tables
 from vap_core.study.register import (
     GAP_PX,
     RIGHT,
@@ -60,8 +62,8 @@ from vap_core.study.register import (
     write_picture,
     write_sheet,
 )
-from vap_core.study.stats import DRAWS, Estimate, clustered_share
-from vap_core.study.store import read_json_part, write_json_part, write_table
+from vap_core.study.stats import clustered_share, mean_by, share_by, summary
+from vap_core.study.table import printed
 from vap_core.vote import similarity, vote
 
 if TYPE_CHECKING:
@@ -70,25 +72,18 @@ if TYPE_CHECKING:
 BOX = ("x0", "y0", "x1", "y1")
 MASKS = "masks"
 SCENES_CSV, BOXES_CSV, OBJECTS_CSV = "scenes.csv", "references/boxes.csv", "objects.csv"
-FORM = "see python -m vap_core measure photos --help"
 Box = Float32[np.ndarray, "4"]
 
 
 @value
-class ReferencePhoto:
-    """A photo of an object, and its box where the folder gives one."""
-
-    path: Path
-    box: Box | None
-
-
-@value
 class Subject:
-    """An object with references: what is registered and asked for."""
+    """An object with references, what is registered and asked for: its photos, each with its box
+    where the folder gives one.
+    """
 
     name: str
     category: str
-    photos: tuple[ReferencePhoto, ...]
+    photos: tuple[tuple[Path, Box | None], ...]
 
 
 @value
@@ -118,8 +113,11 @@ class PhotoSet:
     @property
     def rivals(self) -> tuple[str, ...]:
         """The objects of scenes without references, which are never asked for."""
-        asked = {subject.name for subject in self.subjects}
-        return tuple(sorted(set(self.categories) - asked))
+        return tuple(sorted(set(self.categories) - {subject.name for subject in self.subjects}))
+
+
+def _wrong(text: str) -> BadPhotoSet:
+    return BadPhotoSet(f"measure photos: {text}")
 
 
 def read_photo_set(folder: Path) -> PhotoSet:
@@ -128,68 +126,48 @@ def read_photo_set(folder: Path) -> PhotoSet:
     Raises: BadPhotoSet: something is missing, or a line does not fit; the message names it.
     """
     if not folder.is_dir():
-        raise BadPhotoSet(f"measure photos: {folder} is no folder; {FORM}.")
+        raise _wrong(f"{folder} is no folder; see python -m vap_core measure photos --help.")
     photos = _read_references(folder)
     scenes = _read_scenes(folder, photos)
-    _refuse_unasked(folder, photos, scenes)
-    named = set(photos)
-    for scene in scenes:
-        named |= set(scene.boxes)
-    categories = read_categories(folder, named)
-    subjects = []
-    for name, of_object in photos.items():
-        subjects.append(Subject(name, categories[name], of_object))
-    return PhotoSet(
-        subjects=tuple(subjects),
-        scenes=scenes,
-        categories=categories,
-        sha256=_sha256(folder),
-    )
-
-
-def _refuse_unasked(folder: Path, photos: Mapping[str, Any], scenes: Iterable["Scene"]) -> None:
-    """Refuse a set in whose scenes no object with references is named, as where it is misspelt."""
-    shown: set[str] = set()
-    for scene in scenes:
-        shown |= set(scene.boxes)
+    shown = {name for scene in scenes for name in scene.boxes}
     if photos and shown.isdisjoint(photos):
-        raise BadPhotoSet(
-            f"measure photos: {folder / SCENES_CSV} names {', '.join(sorted(shown)[:4])}, "
-            f"references are there of {', '.join(sorted(photos)[:4])}; name an object alike in "
-            "both."
+        raise _wrong(
+            f"{folder / SCENES_CSV} names {', '.join(sorted(shown)[:4])}, references are there of "
+            f"{', '.join(sorted(photos)[:4])}; name an object alike in both."
         )
+    categories = read_categories(folder, {*photos, *shown})
+    subjects = [Subject(name, categories[name], found) for name, found in photos.items()]
+    return PhotoSet(tuple(subjects), scenes, categories, _sha256(folder))
 
 
-def _read_references(folder: Path) -> dict[str, tuple[ReferencePhoto, ...]]:
+def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], ...]]:
     """The photos of every object, with their boxes."""
     root = folder / "references"
-    folders = []
-    if root.is_dir():
-        folders = sorted(path for path in root.iterdir() if path.is_dir())
+    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     if not folders and (folder / MASKS).is_dir():
         return {}
     if not folders:
-        raise BadPhotoSet(
-            f"measure photos: {root} holds no folder of photos; put each object's photos into "
-            "references/OBJECT."
+        raise _wrong(
+            f"{root} holds no folder of photos; put each object's photos into references/OBJECT."
         )
-    boxes = read_boxes(folder / BOXES_CSV)
+    boxes: dict[str, Box | None] = {}
+    table = folder / BOXES_CSV
+    for line, row in _read_csv(table, ("photo", *BOX)) if table.exists() else ():
+        boxes[row["photo"]] = _parse_box(row, f"{table} line {line}")
     objects = {}
     for path in folders:
         check_object_folder(path)
-        photos = []
-        for photo in photos_in(path):
-            photos.append(ReferencePhoto(photo, boxes.pop(f"{path.name}/{photo.name}", None)))
+        photos = [
+            (photo, boxes.pop(f"{path.name}/{photo.name}", None)) for photo in photos_in(path)
+        ]
         if not photos:
-            raise BadPhotoSet(
-                f"measure photos: {path} holds no picture; put photos of the object there, or "
-                "remove the folder."
+            raise _wrong(
+                f"{path} holds no picture; put photos of the object there, or remove the folder."
             )
         objects[path.name] = tuple(photos)
     if boxes:
-        raise BadPhotoSet(
-            f"measure photos: {folder / BOXES_CSV} names {sorted(boxes)[0]!r}, which is not there; "
-            "name photos as OBJECT/FILE."
+        raise _wrong(
+            f"{table} names {sorted(boxes)[0]!r}, which is not there; name photos as OBJECT/FILE."
         )
     return objects
 
@@ -200,104 +178,75 @@ def check_object_folder(path: Path, caller: str = "measure photos") -> None:
         raise BadPhotoSet(f"{caller}: {path} cannot name an object; call it by {NAME_RULE}.")
 
 
-def read_boxes(path: Path) -> dict[str, Box]:
-    """The boxes of photos by OBJECT/FILE, none without the table. Raises: BadPhotoSet."""
-    boxes: dict[str, Box] = {}
-    if path.exists():
-        for line, row in _read_csv(path, ("photo", *BOX)):
-            box = _parse_box(row, f"{path} line {line}")
-            if box is not None:
-                boxes[row["photo"]] = box
-    return boxes
-
-
 def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
     """Every scene with its rows of scenes.csv."""
     root, table = folder / "scenes", folder / SCENES_CSV
     if not root.is_dir() or not photos_in(root):
-        raise BadPhotoSet(f"measure photos: {root} holds no picture; put photos of scenes there.")
+        raise _wrong(f"{root} holds no picture; put photos of scenes there.")
     if not table.exists():
-        raise BadPhotoSet(
-            f"measure photos: {table} is not there; write a line scene,object,x0,y0,x1,y1 for "
-            "every object of every scene."
+        raise _wrong(
+            f"{table} is not there; write a line scene,object,x0,y0,x1,y1 for every object of "
+            "every scene."
         )
     paths = {path.name: path for path in photos_in(root)}
     rows: dict[str, dict[str, list[Box]]] = {}
     for line, row in _read_csv(table, ("scene", "object", *BOX)):
-        where = f"{table} line {line}"
+        where, name = f"{table} line {line}", row["object"]
         if row["scene"] not in paths:
-            raise BadPhotoSet(
-                f"measure photos: {where} names the scene {row['scene']!r}, which is not in "
-                f"{root}; give its file name."
+            raise _wrong(
+                f"{where} names the scene {row['scene']!r}, which is not in {root}; give its file "
+                "name."
             )
         box = _parse_box(row, where)
-        if box is None and row["object"] not in known:
-            raise BadPhotoSet(
-                f"measure photos: {where} has no box and no references of {row['object']!r}; give "
-                f"one, or put photos into references/{row['object']}."
+        if box is None and name not in known:
+            raise _wrong(
+                f"{where} has no box and no references of {name!r}; give one, or put photos into "
+                f"references/{name}."
             )
-        boxes = rows.setdefault(row["scene"], {}).setdefault(row["object"], [])
-        if box is not None:
-            boxes.append(box)
+        boxes = rows.setdefault(row["scene"], {}).setdefault(name, [])
+        boxes += [] if box is None else [box]
+    missing = [name for name in paths if name not in rows]
+    if missing:
+        raise _wrong(
+            f"{table} has no line for {missing[0]}; name its objects, or remove it from {root}."
+        )
     scenes = []
     for name, path in paths.items():
-        if name not in rows:
-            raise BadPhotoSet(
-                f"measure photos: {table} has no line for {name}; name its objects, or remove it "
-                f"from {root}."
-            )
-        of_scene = {}
-        for obj, boxes in rows[name].items():
-            of_scene[obj] = np.array(boxes, np.float32).reshape(-1, 4)
-        scenes.append(Scene(name, path, of_scene, _masks_of(folder, name, of_scene)))
-    _refuse_other_masks(folder, paths)
-    return tuple(scenes)
-
-
-def _masks_of(
-    folder: Path, scene: str, boxes: Mapping[str, Float32[np.ndarray, "_n 4"]]
-) -> dict[str, Path]:
-    """The masks of one scene by the object's name. Raises: BadPhotoSet."""
-    root = folder / MASKS / scene
-    masks = {}
-    if root.is_dir():
-        for path in photos_in(root):
-            if path.stem not in boxes or len(boxes[path.stem]) != 1:
-                raise BadPhotoSet(
-                    f"measure photos: {path} is a mask, but {SCENES_CSV} gives no single box of "
-                    f"{path.stem!r} in {scene}; name masks as {MASKS}/SCENE/OBJECT.png."
+        of_scene = {
+            obj: np.array(boxes, np.float32).reshape(-1, 4) for obj, boxes in rows[name].items()
+        }
+        masks = {}
+        place = folder / MASKS / name
+        for mask in photos_in(place) if place.is_dir() else ():
+            if len(of_scene.get(mask.stem, ())) != 1:
+                raise _wrong(
+                    f"{mask} is a mask, but {SCENES_CSV} gives no single box of {mask.stem!r} in "
+                    f"{name}; name masks as {MASKS}/SCENE/OBJECT.png."
                 )
-            masks[path.stem] = path
-    return masks
-
-
-def _refuse_other_masks(folder: Path, scenes: Mapping[str, Any]) -> None:
-    if not (folder / MASKS).is_dir():
-        return
-    for path in sorted((folder / MASKS).iterdir()):
-        if path.is_dir() and path.name not in scenes:
-            raise BadPhotoSet(
-                f"measure photos: {path} holds masks of no scene; name the folder as the scene's "
-                "file, for example masks/desk.jpg."
+            masks[mask.stem] = mask
+        scenes.append(Scene(name, path, of_scene, masks))
+    for path in sorted((folder / MASKS).iterdir()) if (folder / MASKS).is_dir() else ():
+        if path.is_dir() and path.name not in paths:
+            raise _wrong(
+                f"{path} holds masks of no scene; name the folder as the scene's file, for example "
+                "masks/desk.jpg."
             )
+    return tuple(scenes)
 
 
 def read_categories(
     folder: Path, named: Iterable[str], caller: str = "measure photos"
 ) -> dict[str, str]:
     """The kind of every object: objects.csv's, else its name. Raises: BadPhotoSet."""
-    categories = {}
-    for name in named:
-        categories[name] = name.replace("_", " ").replace("-", " ").strip()
+    categories = {name: name.replace("_", " ").replace("-", " ").strip() for name in named}
     table = folder / OBJECTS_CSV
-    if table.exists():
-        for line, row in _read_csv(table, ("object", "category")):
-            if row["object"] not in categories:
-                raise BadPhotoSet(
-                    f"{caller}: {table} line {line} names {row['object']!r}, which has no "
-                    "references and is in no scene; mend the name."
-                )
-            categories[row["object"]] = row["category"]
+    for line, row in _read_csv(table, ("object", "category")) if table.exists() else ():
+        if row["object"] not in categories:
+            raise BadPhotoSet(
+                f"{caller}: {table} line {line} names {row['object']!r}, which has no references "
+                "and is in no scene; mend the name."
+            )
+        categories[row["object"]] = row["category"]
     for name, category in categories.items():
         categories[name] = plain_category(category)
         if kind_instead(category):
@@ -318,22 +267,18 @@ def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
     cells = [row[name] for name in BOX]
     if not any(cells):
         return None
+    told = f"{where} has the box {','.join(cells)!r}"
     try:
         box = np.array([float(cell) for cell in cells], np.float32)
     except ValueError as error:
-        raise BadPhotoSet(
-            f"measure photos: {where} has the box {','.join(cells)!r}; give four numbers "
-            "x0,y0,x1,y1, or none where the object is absent."
+        raise _wrong(
+            f"{told}; give four numbers x0,y0,x1,y1, or none where the object is absent."
         ) from error
     if not np.isfinite(box).all() or not (box[2:] > box[:2]).all():
-        raise BadPhotoSet(
-            f"measure photos: {where} has the box {','.join(cells)!r} without area; x to the "
-            "right, y down, far corner last."
-        )
+        raise _wrong(f"{told} without area; x to the right, y down, far corner last.")
     if (box[2:] - box[:2] < 1).any() or box.max() <= 1:
-        raise BadPhotoSet(
-            f"measure photos: {where} has the box {','.join(cells)!r} with a side of a pixel or "
-            "less; give pixels, not fractions of the picture."
+        raise _wrong(
+            f"{told} with a side of a pixel or less; give pixels, not fractions of the picture."
         )
     return box
 
@@ -343,8 +288,7 @@ def _sha256(folder: Path) -> str:
     digest = hashlib.sha256()
     tables = [folder / SCENES_CSV, folder / BOXES_CSV, folder / OBJECTS_CSV]
     pictures = [*(folder / "references").rglob("*"), *(folder / "scenes").iterdir()]
-    pictures += (folder / MASKS).rglob("*")
-    for path in sorted({*tables, *pictures}):
+    for path in sorted({*tables, *pictures, *(folder / MASKS).rglob("*")}):
         if path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
@@ -354,7 +298,6 @@ def _sha256(folder: Path) -> str:
 CAMERA = "photo"
 BEYOND_PX = 4
 """How far a box that is drawn by hand may reach beyond its photo; it is clipped."""
-Row = dict[str, Any]
 Memory = Mapping[str, PersonalObject]
 
 
@@ -367,30 +310,35 @@ def measure_scene(
     """
     rgb = load_photo(scene.path, long_side=None)
     scene = clip_boxes(scene, rgb)
-    true_boxes, owners = _true_boxes(scene)
-    candidates = _candidates(rgb, true_boxes, attender.stack)
+    owners = np.array([name for name, boxes in scene.boxes.items() for _ in boxes], str)
+    true_boxes = _true_boxes(np.concatenate([np.zeros((0, 4), np.float32), *scene.boxes.values()]))
+    stack = attender.stack
+    candidates = segment(rgb, embed(rgb, judge(rgb, true_boxes, stack), stack), stack)
     rows = []
     for name, boxes in scene.boxes.items():
         if name not in memory:
             continue
         category = photo_set.categories[name]
-        kinds = [photo_set.categories[owner] for owner in owners]
-        own = np.array([owner == name for owner in owners], bool)
-        same_kind = np.array([kind == category for kind in kinds], bool)
+        own = owners == name
+        alike = np.array([photo_set.categories[owner] == category for owner in owners], bool)
         row: Row = {
             "scene": scene.name,
             "object": name,
             "category": category,
             "present": len(boxes) > 0,
-            "lookalikes": int((same_kind & ~own).sum()),
+            "lookalikes": int((alike & ~own).sum()),
         }
         row |= _ground(rgb, boxes, memory[name], attender)
         if len(boxes):
             every = np.ones(len(own), bool)
-            row |= _vote("all", own, every, candidates, memory[name], attender, rgb)
-            row |= _vote("kind", own, same_kind, candidates, memory[name], attender, rgb)
+            for among, eligible in (("all", every), ("kind", alike)):
+                row |= _vote(among, own, eligible, candidates, memory[name], attender, rgb)
         rows.append(row)
     return rows
+
+
+def _true_boxes(xyxy: Float32[np.ndarray, "n 4"]) -> Boxes:
+    return Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes")
 
 
 def clip_boxes(scene: Scene, rgb: Rgb) -> Scene:
@@ -403,34 +351,14 @@ def clip_boxes(scene: Scene, rgb: Rgb) -> Scene:
     for name, boxes in scene.boxes.items():
         clipped[name] = np.clip(boxes, 0, (width, height, width, height)).astype(np.float32)
         for box, inside in zip(boxes, clipped[name], strict=True):
-            flaw = ""
-            if abs(box - inside).max() > BEYOND_PX:
-                flaw = "reaches beyond"
-            if (inside[2:] - inside[:2] < 1).any():
-                flaw = "lies outside"
+            flaw = "reaches beyond" if abs(box - inside).max() > BEYOND_PX else ""
+            flaw = "lies outside" if (inside[2:] - inside[:2] < 1).any() else flaw
             if flaw:
-                raise BadPhotoSet(
-                    f"measure photos: the box {box.tolist()} of {name!r} {flaw} {scene.path}, "
-                    f"which has {width}x{height} pixels when upright; mend scenes.csv."
+                raise _wrong(
+                    f"the box {box.tolist()} of {name!r} {flaw} {scene.path}, which has "
+                    f"{width}x{height} pixels when upright; mend scenes.csv."
                 )
     return replace(scene, boxes=clipped)
-
-
-def _true_boxes(scene: Scene) -> tuple[Boxes, list[str]]:
-    """Every box of the scene, and whose it is."""
-    every = [np.zeros((0, 4), np.float32)]
-    owners = []
-    for name, boxes in scene.boxes.items():
-        every.append(boxes)
-        owners += [name] * len(boxes)
-    xyxy = np.concatenate(every)
-    return Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes"), owners
-
-
-def _candidates(rgb: Rgb, boxes: Boxes, stack: Stack) -> Candidates:
-    """The true boxes, embedded as boxes of such a photo are, and their masks."""
-    judged = judge(rgb, boxes, stack)
-    return segment(rgb, embed(rgb, judged, stack), stack)
 
 
 def judge(rgb: Rgb, boxes: Boxes, stack: Stack) -> Boxes:
@@ -443,52 +371,35 @@ def judge(rgb: Rgb, boxes: Boxes, stack: Stack) -> Boxes:
 def _ground(
     rgb: Rgb, boxes: Float32[np.ndarray, "_ 4"], obj: PersonalObject, attender: Attender
 ) -> Row:
-    """The method's first step on the photo, and how its choice overlaps the true boxes."""
+    """The method's first step on the photo, and how its choice overlaps the true boxes.
+
+    The box that the vote elected is there whether it is tinted or not; None without candidates.
+    """
     started, cpu_started = perf_counter(), process_time()
     instruction = f"bring my {obj.category}"
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=[obj.name])
     seconds, cpu_seconds = perf_counter() - started, process_time() - cpu_started
     (grounding,) = attended.groundings[CAMERA]
-    overlap = box_iou(grounding.candidates.xyxy, boxes).max(axis=1, initial=0.0)
-    row: Row = {
+    candidates, chosen = grounding.candidates, grounding.chosen
+    overlap = box_iou(candidates.xyxy, boxes).max(axis=1, initial=0.0)
+    elected: Row = dict.fromkeys((*BOX, "cosine", "likeness", "chosen_iou", "margin"))
+    if chosen is not None:
+        elected = dict(zip(BOX, candidates.xyxy[chosen].tolist(), strict=True))
+        elected["cosine"] = float(grounding.similarity[chosen].mean())
+        elected["likeness"] = float(grounding.likeness[chosen])
+        elected["chosen_iou"] = float(overlap[chosen])
+        elected["margin"] = grounding.ballot.margin
+    compared = chosen is not None and candidates.verified is not None
+    return {
         "candidates": len(overlap),
         "proposed_iou": float(overlap.max(initial=0.0)),
         "tinted": grounding.winner is not None,
-        "verified": _points(grounding),
-        "familiar": grounding.candidates.familiar,
-        "iou": 0.0,
+        "verified": int(candidates.verified[chosen]) if compared else None,
+        "familiar": candidates.familiar,
+        "iou": 0.0 if grounding.winner is None else float(overlap[grounding.winner]),
         "ms": round(1000 * seconds, 1),
         "cpu_ms": round(1000 * cpu_seconds, 1),
-        **_elected(grounding, overlap),
-    }
-    if grounding.winner is not None:
-        row["iou"] = float(overlap[grounding.winner])
-    return row
-
-
-def _points(grounding: Grounding) -> int | None:
-    """The verified points of the elected box; None where none were compared."""
-    if grounding.chosen is None or grounding.candidates.verified is None:
-        return None
-    return int(grounding.candidates.verified[grounding.chosen])
-
-
-def _elected(grounding: Grounding, overlap: Float[np.ndarray, " n"]) -> Row:
-    """The box that the vote elected, tinted or not; None without candidates."""
-    winner = grounding.chosen
-    if winner is None:
-        names = ("x0", "y0", "x1", "y1", "cosine", "likeness", "chosen_iou", "margin")
-        return dict.fromkeys(names)
-    x0, y0, x1, y1 = grounding.candidates.xyxy[winner].tolist()
-    return {
-        "x0": x0,
-        "y0": y0,
-        "x1": x1,
-        "y1": y1,
-        "cosine": float(grounding.similarity[winner].mean()),
-        "likeness": float(grounding.likeness[winner]),
-        "chosen_iou": float(overlap[winner]),
-        "margin": grounding.ballot.margin,
+        **elected,
     }
 
 
@@ -509,17 +420,15 @@ def _vote(
     rows = np.flatnonzero(eligible)
     if own[rows].all():
         return dict.fromkeys(names)
-    among_them = _take(candidates, rows)
-    right_alone = []
-    for k in range(len(obj.crops)):
-        elected = _elect(rgb, obj.take(slice(k, k + 1)), among_them, attender)
-        right_alone.append(bool(own[rows[elected]]))
-    elected = _elect(rgb, obj, among_them, attender)
-    return {
-        names[0]: len(rows),
-        names[1]: float(np.mean(right_alone)),
-        names[2]: bool(own[rows[elected]]),
-    }
+    few = Candidates(
+        boxes=candidates.boxes.take(rows),
+        embeddings=candidates.embeddings[rows],
+        masks=candidates.masks[rows],
+        ids=tuple(range(len(rows))),
+    )
+    singles = [obj.take(slice(k, k + 1)) for k in range(len(obj.crops))]
+    *alone, together = (own[rows[_elect(rgb, each, few, attender)]] for each in (*singles, obj))
+    return dict(zip(names, (len(rows), float(np.mean(alone)), bool(together)), strict=True))
 
 
 def _elect(rgb: Rgb, obj: PersonalObject, among: Candidates, attender: Attender) -> int:
@@ -531,16 +440,6 @@ def _elect(rgb: Rgb, obj: PersonalObject, among: Candidates, attender: Attender)
     winner = attender.ground(CAMERA, obj, among).ballot.winner
     assert winner is not None, "there are candidates"
     return winner
-
-
-def _take(candidates: Candidates, rows: Int64[np.ndarray, " m"]) -> Candidates:
-    """These candidates, in this order."""
-    return Candidates(
-        boxes=candidates.boxes.take(rows),
-        embeddings=candidates.embeddings[rows],
-        masks=candidates.masks[rows],
-        ids=tuple(range(len(rows))),
-    )
 
 
 CHOSEN = 3
@@ -555,22 +454,18 @@ def mask_rows(scene: Scene, stack: Stack) -> list[Row]:
     Raises: BadPhoto, BadPhotoSet: a mask cannot be read, or is not as large as its scene; or as
         `clip_boxes`.
     """
-    if not scene.masks:
-        return []
     rgb = load_photo(scene.path, long_side=None)
     names = sorted(scene.masks)
-    true_boxes = clip_boxes(scene, rgb).boxes
-    xyxy = np.concatenate([true_boxes[name] for name in names])
-    boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes")
+    clipped = clip_boxes(scene, rgb).boxes
+    boxes = _true_boxes(np.concatenate([clipped[name] for name in names]))
     found = stack.segmenter(rgb, judge(rgb, boxes, stack))
     rows: list[Row] = []
     for name, mask in zip(names, found, strict=True):
         truth = load_mask(scene.masks[name])
         if truth.shape != mask.shape:
-            raise BadPhotoSet(
-                f"measure photos: the mask {scene.masks[name]} has "
-                f"{truth.shape[1]}x{truth.shape[0]} pixels, its scene "
-                f"{mask.shape[1]}x{mask.shape[0]}; save it as large as the upright photo."
+            raise _wrong(
+                f"the mask {scene.masks[name]} has {truth.shape[1]}x{truth.shape[0]} pixels, its "
+                f"scene {mask.shape[1]}x{mask.shape[0]}; save it as large as the upright photo."
             )
         rows.append({"scene": scene.name, "object": name, "mask_iou": mask_iou(mask, truth)})
     return rows
@@ -586,11 +481,9 @@ def single_rows(memory: Mapping[str, PersonalObject], stack: Stack) -> list[Row]
     rows_of = {name: reference_rows(obj, encoder) for name, obj in memory.items()}
     rows: list[Row] = []
     for name, own in rows_of.items():
-        kind = memory[name].category
         others = [other for other in memory if other != name]
-        alike = [other for other in others if memory[other].category == kind]
-        if len(alike) >= 2:
-            others = alike
+        alike = [other for other in others if memory[other].category == memory[name].category]
+        others = alike if len(alike) >= 2 else others
         if len(own) <= CHOSEN or len(others) < 2:
             continue
         rng = np.random.default_rng(0)
@@ -631,6 +524,12 @@ class Pan:
         moved = boxes - self.left[frame] * np.array([1.0, 0.0, 1.0, 0.0])
         return moved * self.scale
 
+    def with_twins(self, boxes: Float[np.ndarray, "n 4"]) -> Float64[np.ndarray, "m 4"]:
+        """Each box of the photo, and then that of its copy."""
+        twin = np.array([self.photo_width, 0.0, self.photo_width, 0.0])
+        pairs = np.stack([boxes.astype(np.float64), boxes + twin], axis=1)
+        return pairs.reshape(-1, 4)
+
 
 def pan_over(rgb: Rgb) -> Pan:
     """The path of the window over a photo and its copy: all of the photo, all of the copy, back."""
@@ -652,7 +551,7 @@ def frames_of(rgb: Rgb, pan: Pan) -> Iterator[Rgb]:
 
 
 def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
-    """A row for every object that is in view and has references.
+    """A row for every object that is in view and has references, tracked through the clip.
 
     `end` is what the mask lies on when the window is back: object, twin, other, or "" for no mask.
     `on_object` counts frames, of the `in_view` ones, `on_twin` of all `frames`.
@@ -662,37 +561,29 @@ def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
     rgb = load_photo(scene.path, long_side=None)
     scene = clip_boxes(scene, rgb)
     pan = pan_over(rgb)
-    subjects = {subject.name for subject in photo_set.subjects}
-    rows = []
-    for name, boxes in scene.boxes.items():
-        if name in subjects and len(boxes):
-            rows.append(
-                {"scene": scene.name, "object": name, **_follow(rgb, pan, scene, name, stack)}
-            )
-    return rows
-
-
-def _follow(rgb: Rgb, pan: Pan, scene: Scene, name: str, stack: Stack) -> Row:
-    """Track one object through the clip."""
-    own = scene.boxes[name][0].astype(np.float64)
-    twin = own + np.array([pan.photo_width, 0.0, pan.photo_width, 0.0])
-    pair = np.stack([own, twin])
-    counts = {"frames": FRAMES, "in_view": 0, "on_object": 0, "on_twin": 0}
-    end = ""
-    states: list[Any] = []
-    for number, frame in enumerate(frames_of(rgb, pan)):
-        if number == 0:
-            states, mask = _start(frame, pan, scene, name, stack)
-        else:
-            states, tracks = stack.tracker.step(states, [frame])
-            mask = tracks[0][0].mask
-        here = pan.boxes(number, pair)
-        end = lies_on(mask, here)
-        if visible_share(here[0], frame) >= IN_VIEW:
-            counts["in_view"] += 1
-            counts["on_object"] += end == "object"
-        counts["on_twin"] += end == "twin"
-    return {**counts, "end": end}
+    rows: list[Row] = []
+    for name in (subject.name for subject in photo_set.subjects):
+        if not len(scene.boxes.get(name, ())):
+            continue
+        pair = pan.with_twins(scene.boxes[name][:1])
+        row: Row = {"scene": scene.name, "object": name, "frames": FRAMES}
+        row |= {"in_view": 0, "on_object": 0, "on_twin": 0, "end": ""}
+        states: list[Any] = []
+        for number, frame in enumerate(frames_of(rgb, pan)):
+            if number == 0:
+                states, mask = _start(frame, pan, scene, name, stack)
+            else:
+                states, tracks = stack.tracker.step(states, [frame])
+                mask = tracks[0][0].mask
+            here = pan.boxes(number, pair)
+            row["end"] = lies_on(mask, here)
+            if visible_share(here[0], frame) >= IN_VIEW:
+                row["in_view"] += 1
+                row["on_object"] += row["end"] == "object"
+            row["on_twin"] += row["end"] == "twin"
+        rows.append(row)
+    order = list(scene.boxes)
+    return sorted(rows, key=lambda row: order.index(row["object"]))
 
 
 def _start(
@@ -700,17 +591,12 @@ def _start(
 ) -> tuple[list[Any], Mask | None]:
     """The tracker of the first frame, and the object's mask there; the object is identity 0."""
     order = [name, *(other for other in scene.boxes if other != name)]
-    known: list[np.ndarray] = []
-    for other in order:
-        for box in scene.boxes[other][:1].astype(np.float64):
-            twin = box + np.array([pan.photo_width, 0.0, pan.photo_width, 0.0])
-            known += [box, twin]
-    here = pan.boxes(0, np.stack(known))
+    known = np.concatenate([scene.boxes[other][:1] for other in order])
+    here = pan.boxes(0, pan.with_twins(known))
     kept = [i for i, box in enumerate(here) if i == 0 or visible_share(box, frame) >= IN_VIEW]
     height, width = frame.shape[:2]
     xyxy = np.clip(here[kept], 0, (width, height, width, height)).astype(np.float32)
-    boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), "true boxes")
-    masks = stack.segmenter(frame, judge(frame, boxes, stack))
+    masks = stack.segmenter(frame, judge(frame, _true_boxes(xyxy), stack))
     tracker = stack.tracker
     if isinstance(tracker, TargetTracker):
         return tracker.start_targets([frame], [masks], [[0]]), masks[0]
@@ -750,45 +636,112 @@ NOTE = (
 
 
 def text_report(table: "pd.DataFrame") -> str:
-    """What the command prints."""
+    """What the command prints of the questions."""
     seconds = f"ms a photo: median {table.ms.median():.0f}, slowest {table.ms.max():.0f}"
     if "cpu_ms" in table:
         cpu = table.cpu_ms
         seconds += f"; of CPU: median {cpu.median():.0f}, slowest {cpu.max():.0f}"
-    parts = [align(object_rows(table)), align(scene_rows(table)), align(vote_rows(table))]
+    parts = [printed(each(table)) for each in (object_table, scene_table, vote_table)]
     return "\n\n".join([*parts, f"{seconds}\n{NOTE}"])
+
+
+def _judged(table: "pd.DataFrame") -> "pd.DataFrame":
+    """With what became of every question."""
+    right, loose = table.iou >= RIGHT_IOU, table.iou >= LOOSE_IOU
+    elected = table.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU
+    return table.assign(
+        **{
+            "proposed": table.proposed_iou >= RIGHT_IOU,
+            "right": right,
+            "right at IoU .25": loose,
+            "wrong tinted": table.tinted & ~right,
+            "silent": ~table.tinted.astype(bool),
+            "not in view": (~table.tinted.astype(bool)).where(elected),
+        }
+    )
+
+
+def object_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One line per object, and one for all: counts."""
+    import pandas as pd
+
+    found = _judged(table)
+    seen, absent = found.present.astype(bool), ~found.present.astype(bool)
+    flags = {
+        "in view": seen,
+        "right": seen & found.right,
+        "IoU .25": seen & found["right at IoU .25"],
+        "wrong": seen & found["wrong tinted"],
+        "silent": seen & found.silent,
+        "absent": absent,
+        "tinted": absent & found.tinted.astype(bool),
+    }
+    keyed = found[["object"]].assign(kind=found.category, **flags)
+    whole = pd.concat([keyed.sort_values(["object", "kind"]), keyed.assign(object="all", kind="")])
+    return whole.groupby(["object", "kind"], sort=False)[list(flags)].sum().reset_index()
+
+
+def scene_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """One line per kind of scene: with the object and without, with look-alikes and without."""
+    import pandas as pd
+
+    found = _judged(table)
+    seen, beside = found.present.astype(bool), found.lookalikes > 0
+    kinds = {
+        "object in view": seen,
+        "- beside look-alikes": seen & beside,
+        "- alone of its kind": seen & ~beside,
+        "object absent": ~seen,
+        "- look-alikes in view": ~seen & beside,
+        "- none of its kind": ~seen & ~beside,
+    }
+    measures = ["proposed", "right", "right at IoU .25", "wrong tinted", "silent", "not in view"]
+    lines = []
+    for name, chosen in kinds.items():
+        cells = dict.fromkeys(measures, "")
+        for each in measures if len(lines) < 3 else ("wrong tinted", "silent"):
+            cells[each] = share_by(found[chosen], each, ["scene"]).text(digits=0)
+        lines.append({"scenes": name, **cells})
+    return pd.DataFrame(lines)
+
+
+def vote_table(table: "pd.DataFrame") -> "pd.DataFrame":
+    """How the vote does among the true boxes of a scene."""
+    import pandas as pd
+
+    lines = []
+    for among, name in (("all", "all true boxes"), ("kind", "those of its kind")):
+        column = f"{among}_boxes"
+        known = table.dropna(subset=[column]) if column in table else table.iloc[:0]
+        line = dict.fromkeys(("boxes", "chance", "one reference", "all references"), "-")
+        if len(known):
+            boxes = known[column].to_numpy(float)
+            line["boxes"], line["chance"] = f"{boxes.mean():.1f}", f"{100 * (1 / boxes).mean():.0f}"
+            for part, title in (("one", "one reference"), ("every", "all references")):
+                line[title] = share_by(known, f"{among}_{part}", ["scene"]).text(digits=0)
+        lines.append({"vote among": name, **line})
+    return pd.DataFrame(lines)
 
 
 def clip_report(clips: "pd.DataFrame") -> str:
     """What became of the objects in clips made of the scenes."""
-    if not len(clips):
+    if "end" not in clips:
         return "clips: no object with references is in view in any scene"
-    rows = [["clips", "on the object", "on its twin", "elsewhere", "no mask"]]
-    cells = []
-    for end in ("object", "twin", "other", ""):
-        cells.append(_share(clips.end == end, clips))
-    rows.append(["at the end", *cells])
-    in_view, on_object = int(clips.in_view.sum()), int(clips.on_object.sum())
-    on_twin, frames = int(clips.on_twin.sum()), int(clips.frames.sum())
+    ends = {"on the object": "object", "on its twin": "twin", "elsewhere": "other", "no mask": ""}
+    flags = clips.assign(**{name: clips.end == end for name, end in ends.items()})
+    table = summary(flags, share=list(ends), cluster=["scene"])[list(ends)]
+    table.insert(0, "clips", "at the end")
+    total = clips[["in_view", "on_object", "on_twin", "frames"]].sum()
     return (
-        f"{align(rows)}\n\nclips: the object's mask in {on_object} of {in_view} frames that show "
-        f"it, its twin's in {on_twin} of {frames} frames. The window pans from a photo to a copy "
-        "of it and back; the tracker starts from the true boxes."
+        f"{printed(table.map(lambda each: each if isinstance(each, str) else each.text(digits=0)))}"
+        f"\n\nclips: the object's mask in {total.on_object} of {total.in_view} frames that show "
+        f"it, its twin's in {total.on_twin} of {total.frames} frames. The window pans from a photo "
+        "to a copy of it and back; the tracker starts from the true boxes."
     )
-
-
-def mask_report(masks: "pd.DataFrame") -> str:
-    """How well the true masks are met from true boxes; the interval resamples scenes."""
-    if not len(masks):
-        return ""
-    estimate = clustered_mean(masks.mask_iou.to_numpy(np.float64), masks.scene)
-    return f"masks from true boxes: mean IoU {estimate.text(scale=1.0, digits=2)}"
 
 
 def single_report(single: "pd.DataFrame") -> str:
     """How often three references elect a left-out photo of their object among two others'."""
-    if not len(single):
-        return ""
     found = clustered_share(single.right.to_numpy(float), single.object)
     by_object = single.groupby("object").right.mean()
     return (
@@ -796,96 +749,6 @@ def single_report(single: "pd.DataFrame") -> str:
         f"in {found.text()} elections of {len(by_object)} objects, which are the independent "
         f"units; worst: {by_object.idxmin()}, {100 * by_object.min():.0f}"
     )
-
-
-def clustered_mean(values: Float64[np.ndarray, " n"], clusters: Iterable[object]) -> Estimate:
-    """The mean, and percentiles of it when whole clusters are drawn again, seeded."""
-    _, number = np.unique([str(name) for name in clusters], return_inverse=True)
-    sums = np.bincount(number, values)
-    counts = np.bincount(number).astype(np.float64)
-    low = high = float("nan")
-    if len(sums) > 1:
-        share = np.full(len(sums), 1 / len(sums))
-        times = np.random.default_rng(0).multinomial(len(sums), share, DRAWS)
-        low, high = np.percentile(times @ sums / (times @ counts), [2.5, 97.5]).tolist()
-    return Estimate(value=float(values.mean()), low=low, high=high, n=len(values))
-
-
-def object_rows(table: "pd.DataFrame") -> Rows:
-    """One line per object, and one for all: counts."""
-    rows = [
-        ["object", "kind", "in view", "right", "IoU .25", "wrong", "silent", "absent", "tinted"]
-    ]
-    for (name, kind), part in table.groupby(["object", "category"], sort=True):
-        rows.append([str(name), str(kind), *_counts(part)])
-    rows.append(["all", "", *_counts(table)])
-    return rows
-
-
-def scene_rows(table: "pd.DataFrame") -> Rows:
-    """One line per kind of scene: with the object and without, with look-alikes and without."""
-    head = ["scenes", "proposed", "right", "right at IoU .25", "wrong tinted", "silent"]
-    rows = [[*head, "not in view"]]
-    seen, absent = table[table.present], table[~table.present]
-    kinds = (
-        ("object in view", seen),
-        ("- beside look-alikes", seen[seen.lookalikes > 0]),
-        ("- alone of its kind", seen[seen.lookalikes == 0]),
-        ("object absent", absent),
-        ("- look-alikes in view", absent[absent.lookalikes > 0]),
-        ("- none of its kind", absent[absent.lookalikes == 0]),
-    )
-    for number, (name, part) in enumerate(kinds):
-        right = part.iou >= RIGHT_IOU
-        measures = [part.proposed_iou >= RIGHT_IOU, right, part.iou >= LOOSE_IOU]
-        cells = [_share(hits, part) for hits in measures]
-        if number >= 3:
-            cells = ["", "", ""]
-        cells += [_share(part.tinted & ~right, part), _share(~part.tinted, part)]
-        elected = part[part.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU]
-        price = _share(~elected.tinted, elected)
-        rows.append([name, *cells, price if number < 3 else ""])
-    return rows
-
-
-def vote_rows(table: "pd.DataFrame") -> Rows:
-    """How the vote does among the true boxes of a scene."""
-    rows = [["vote among", "boxes", "chance", "one reference", "all references"]]
-    for among, name in (("all", "all true boxes"), ("kind", "those of its kind")):
-        cells = [name]
-        known = table
-        if f"{among}_boxes" in table:
-            known = table.dropna(subset=[f"{among}_boxes"])
-        if f"{among}_boxes" not in table or not len(known):
-            rows.append([*cells, "-", "-", "-", "-"])
-            continue
-        boxes = known[f"{among}_boxes"].to_numpy(float)
-        cells += [f"{boxes.mean():.1f}", f"{100 * (1 / boxes).mean():.0f}"]
-        for column in (f"{among}_one", f"{among}_every"):
-            cells.append(_share(known[column], known))
-        rows.append(cells)
-    return rows
-
-
-def _share(hits: "pd.Series", part: "pd.DataFrame") -> str:
-    """The share of hits with its interval, scenes as clusters."""
-    return clustered_share(hits.to_numpy(float), part.scene).text(digits=0)
-
-
-def _counts(part: "pd.DataFrame") -> list[str]:
-    """In view, right, right at IoU .25, wrong, silent; absent, tinted all the same."""
-    seen, absent = part[part.present], part[~part.present]
-    wrong = seen.tinted & (seen.iou < RIGHT_IOU)
-    counts = (
-        len(seen),
-        (seen.iou >= RIGHT_IOU).sum(),
-        (seen.iou >= LOOSE_IOU).sum(),
-        wrong.sum(),
-        (~seen.tinted).sum(),
-        len(absent),
-        absent.tinted.sum(),
-    )
-    return [str(int(count)) for count in counts]
 
 
 WIDTH_PX, HEIGHT_PX, TILES = 360, 270, 24
@@ -902,8 +765,7 @@ def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> li
     tiles = []
     for name, part in table.groupby("scene", sort=True):
         rgb = load_photo(scenes[str(name)].path, long_side=None)
-        for row in part.to_dict("records"):
-            tiles.append(_tile(rgb, scenes[str(name)], row))
+        tiles += [_tile(rgb, scenes[str(name)], row) for row in part.to_dict("records")]
     paths = []
     for first in range(0, len(tiles), TILES):
         path = folder / f"sheet-{1 + first // TILES:02}.png"
@@ -912,21 +774,23 @@ def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> li
     return paths
 
 
-def _tile(rgb: Rgb, scene: Scene, row: Mapping[str, object]) -> Rgb:
+def _tile(rgb: Rgb, scene: Scene, row: Mapping[Any, Any]) -> Rgb:
     tile, scale = fit(rgb, WIDTH_PX, HEIGHT_PX)
-    name = str(row["object"])
-    for box in scene.boxes[name]:
+    for box in scene.boxes[row["object"]]:
         draw_box(tile, (scale * box).tolist(), TRUTH, 2)
     verdict = "nothing proposed"
     if row["x0"] == row["x0"] and row["x0"] is not None:
-        colour, verdict = _verdict(row)
-        elected = np.array([row["x0"], row["y0"], row["x1"], row["y1"]], np.float64)
+        colour, verdict = (RIGHT, "right") if row["iou"] >= RIGHT_IOU else (WRONG, "wrong")
+        if not row["tinted"]:
+            colour, verdict = SILENT, "not tinted"
+        elected = np.array([row[name] for name in BOX], np.float64)
         draw_box(tile, (scale * elected).tolist(), colour, 2)
     presence = "in view" if row["present"] else "absent"
-    return labelled(tile, [f"{name} ({presence}) in {scene.name}", f"{verdict}{evidence(row)}"])
+    about = f"{row['object']} ({presence}) in {scene.name}"
+    return labelled(tile, [about, f"{verdict}{evidence(row)}"])
 
 
-def evidence(row: Mapping[str, object]) -> str:
+def evidence(row: Mapping[Any, Any]) -> str:
     """What a label says of the elected box, tinted or not; "" where none is elected.
 
     Its overlap with the object, where that is in view, and the likeness that the threshold of "not
@@ -938,17 +802,87 @@ def evidence(row: Mapping[str, object]) -> str:
     return f"{overlap}, likeness {row['likeness']:.2f}"
 
 
-def _verdict(row: Mapping[str, object]) -> tuple[tuple[int, int, int], str]:
-    if not row["tinted"]:
-        return SILENT, "not tinted"
-    iou = row["iou"]
-    assert isinstance(iou, float)
-    if iou >= RIGHT_IOU:
-        return RIGHT, "right"
-    return WRONG, "wrong"
+TABLE = "questions"
+"""The table of what was asked."""
+Kind = Literal["questions", "masks", "clips", "single"]
 
 
-TABLE, CLIPS, MASK_TABLE, SINGLE = "questions", "clips", "masks", "single"
+@dataclass(frozen=True)
+class Job:
+    """What is measured of one scene; `single` of the references alone."""
+
+    kind: Kind
+    scene: str = ""
+
+    @property
+    def name(self) -> str:
+        if self.kind == "single":
+            return self.kind
+        return self.scene if self.kind == TABLE else f"{self.scene}.{self.kind}"
+
+
+@dataclass(frozen=True)
+class PhotoMeasurement(Measurement):
+    """A folder of photos, measured with a stack.
+
+    With `clips` objects are followed through clips made of the scenes, too. Where not `kept`,
+    thresholds that were kept on this machine do not count: the best candidate wins.
+    """
+
+    folder: Path
+    stack: str = "embedded"
+    clips: bool = False
+    kept: bool = True
+    caller: ClassVar[str] = "measure photos"
+
+    def settings(self) -> dict[str, Any]:
+        """Raises: BadPhotoSet; MissingWeights."""
+        return {
+            "measurement": "photos",
+            "photos": _photo_set(self.folder).sha256,
+            "stack": self.stack,
+            "version": __version__,
+            **checksums(self.stack, self.kept),
+        }
+
+    def jobs(self) -> list[Job]:
+        photo_set = _photo_set(self.folder)
+        jobs = [Job(TABLE, scene.name) for scene in photo_set.scenes if photo_set.subjects]
+        jobs += [Job("single")] if photo_set.subjects else []
+        jobs += [Job("masks", scene.name) for scene in photo_set.scenes if scene.masks]
+        return [*jobs, *(Job("clips", scene.name) for scene in photo_set.scenes if self.clips)]
+
+    def prepare(self, folder: Path) -> None:
+        subjects = _photo_set(self.folder).subjects
+        remember_subjects(subjects, _models(self.stack, self.kept), folder / "memory")
+
+    def run(self, job: Job, folder: Path) -> Tables:
+        """Raises: as `measure_scene`, `mask_rows` and `follow_scene`."""
+        photo_set, stack = _photo_set(self.folder), _models(self.stack, self.kept)
+        memory = _memory(self, folder)
+        if job.kind == "single":
+            return {job.kind: single_rows(memory, stack)}
+        (scene,) = (scene for scene in photo_set.scenes if scene.name == job.scene)
+        if job.kind == "masks":
+            return {job.kind: mask_rows(scene, stack)}
+        if job.kind == "clips":
+            return {job.kind: follow_scene(scene, photo_set, stack)}
+        return {job.kind: measure_scene(scene, photo_set, memory, Attender(stack, memory))}
+
+
+_photo_set = cache(read_photo_set)
+
+
+@cache
+def _models(name: str, kept: bool) -> Stack:
+    stack = load_stack(name)
+    return stack if kept or ships_thresholds(name) else replace(stack, thresholds=None)
+
+
+@cache
+def _memory(asked: PhotoMeasurement, folder: Path) -> dict[str, PersonalObject]:
+    known = load_bank(folder / "memory", _models(asked.stack, asked.kept).encoder.name)
+    return {subject.name: known[subject.name] for subject in _photo_set(asked.folder).subjects}
 
 
 def measure_photos(
@@ -962,98 +896,35 @@ def measure_photos(
 ) -> str:
     """Do what `out` lacks of the measurement, write tables and sheets, and return the report.
 
-    With `clips` objects are followed through clips made of the scenes, too (clips.py). Where not
-    `kept`, thresholds that were kept on this machine do not count: the best candidate wins. With
-    `progress` stderr has bars, and a note of the objects that have no references.
+    `clips` and `kept` are `PhotoMeasurement`'s. With `progress` stderr has a bar, and a note of the
+    objects that have no references.
 
     Raises: BadPhotoSet, BadPhoto; MissingWeights; BadOutput when `out` holds another run.
     """
-    import pandas as pd
-
-    photo_set = read_photo_set(folder)
+    for each in (_photo_set, _models, _memory):
+        each.cache_clear()
+    photo_set = _photo_set(folder)
     if progress and photo_set.subjects and photo_set.rivals:
-        print(_rivals_note(photo_set), file=sys.stderr)
-    store.open_run(out, _configuration(photo_set, stack_name, kept))
-    parts: list[str] = []
-    written: list[Path] = []
-    with store.locked(out):
-        stack = load_stack(stack_name)
-        if not kept and not ships_thresholds(stack_name):
-            stack = replace(stack, thresholds=None)
-        if photo_set.subjects:
-            memory = remember_subjects(photo_set.subjects, stack, out / "memory")
-            attender = Attender(stack, memory)
-            table = _of_scenes(
-                photo_set,
-                out,
-                "",
-                progress,
-                lambda scene: measure_scene(scene, photo_set, memory, attender),
-            )
-            single = pd.DataFrame(single_rows(memory, stack))
-            written += write_table(table, out, TABLE)
-            if len(single):
-                written += write_table(single, out, SINGLE)
-            written += write_sheets(photo_set, table, out)
-            parts += [text_report(table), single_report(single)]
-        if any(scene.masks for scene in photo_set.scenes):
-            masks = _of_scenes(
-                photo_set, out, MASK_TABLE, progress, lambda scene: mask_rows(scene, stack)
-            )
-            written += write_table(masks, out, MASK_TABLE)
-            parts.append(mask_report(masks))
-        if clips:
-            followed = _of_scenes(
-                photo_set, out, CLIPS, progress, lambda scene: follow_scene(scene, photo_set, stack)
-            )
-            written += write_table(followed, out, CLIPS)
-            parts.append(clip_report(followed))
-        report = "\n\n".join(part for part in parts if part)
-        with writing(out, "measure photos"):
-            write_atomic(out / "report.txt", f"{report}\n".encode())
-    names = ", ".join(map(str, written))
-    return f"{report}\n\nwrote {names}"
-
-
-def _rivals_note(photo_set: PhotoSet) -> str:
-    """A misspelt object is a rival, too, and no question then asks for it."""
-    return (
-        f"note: {SCENES_CSV} names {', '.join(photo_set.rivals)} without references: taken as "
-        "rivals, not asked for; where one is misspelt, mend it and measure anew"
-    )
-
-
-def _configuration(photo_set: PhotoSet, stack_name: str, kept: bool) -> dict[str, object]:
-    """What the results depend on."""
-    return {
-        "measurement": "photos",
-        "photos": photo_set.sha256,
-        "stack": stack_name,
-        "version": __version__,
-        **checksums(stack_name, kept),
-    }
-
-
-def _of_scenes(
-    photo_set: PhotoSet,
-    out: Path,
-    what: str,
-    progress: bool,
-    measure: Callable[[Scene], list[Row]],
-) -> "pd.DataFrame":
-    """The rows of every scene, measured or read again."""
-    import pandas as pd
-    from tqdm import tqdm
-
-    rows: list[Row] = []
-    suffix = f".{what}.json" if what else ".json"
-    bar = tqdm(photo_set.scenes, unit="scene", desc=what or "photos", disable=not progress)
-    for scene in bar:
-        path = out / "parts" / f"{scene.name}{suffix}"
-        if not path.exists():
-            write_json_part(path, measure(scene), caller="measure photos")
-        rows.extend(read_json_part(path, caller="measure photos"))
-    return pd.DataFrame(rows)
+        # A misspelt object is a rival, too, and no question then asks for it.
+        print(
+            f"note: {SCENES_CSV} names {', '.join(photo_set.rivals)} without references: taken as "
+            "rivals, not asked for; where one is misspelt, mend it and measure anew",
+            file=sys.stderr,
+        )
+    asked = PhotoMeasurement(folder, stack_name, clips, kept)
+    tables = measurement.measure(asked, out, progress=progress)
+    parts = []
+    if TABLE in tables:
+        write_sheets(photo_set, tables[TABLE], out)
+        parts.append(text_report(tables[TABLE]))
+    if len(tables.get("single", ())):
+        parts.append(single_report(tables["single"]))
+    if "masks" in tables:
+        found = mean_by(tables["masks"], "mask_iou", ["scene"])
+        parts.append(f"masks from true boxes: mean IoU {found.text(scale=1.0, digits=2)}")
+    if clips:
+        parts.append(clip_report(tables["clips"]))
+    return measurement.report(asked, "\n\n".join(parts), out)
 
 
 def remember_subjects(
@@ -1070,15 +941,12 @@ def remember_subjects(
     for subject in subjects:
         obj = known.get(subject.name)
         if obj is None:
-            paths = [photo.path for photo in subject.photos]
-            given = {}
-            for i, photo in enumerate(subject.photos):
-                if photo.box is not None:
-                    given[i] = photo.box
+            paths = [path for path, _ in subject.photos]
+            given = {i: box for i, (_, box) in enumerate(subject.photos) if box is not None}
             try:
                 references = choose(paths, subject.category, stack, given, whole=False)
             except BadPhoto as error:
-                raise BadPhotoSet(f"measure photos: {error}") from error
+                raise _wrong(str(error)) from error
             write_sheet(folder / f"{subject.name}.references.png", references, paths)
             obj = remember_references(subject.name, subject.category, references, stack)
             save(folder, obj)

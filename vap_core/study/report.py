@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from vap_core.base.errors import BadOutput, BadRecording, command
-from vap_core.base.files import Rows, align, markdown, signed_interval, write_atomic, writing
-from vap_core.base.pictures import METHODS, method_marks, write_png
+from vap_core.base.files import write_atomic, writing
+from vap_core.base.pictures import write_png
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import extent_m, get_object
 from vap_core.simulation.suites.rules import rejudge
 from vap_core.simulation.types import EpisodeRow, Outcome, Truth
-from vap_core.study import logs, paper
-from vap_core.study.charts import differences_figure, forest_figure, funnel_figure, scores_table
+from vap_core.study import charts, logs, paper
 from vap_core.study.failures import (
     DIAGNOSIS_COLUMNS,
     breakdown,
-    breakdown_rows,
+    breakdown_table,
     diagnosed,
     funnel_table,
     older_text,
@@ -34,7 +33,6 @@ from vap_core.study.failures import (
 )
 from vap_core.study.results import (
     Runs,
-    comparisons,
     errors,
     load_runs,
     outcomes,
@@ -47,16 +45,17 @@ from vap_core.study.stats import (
     RATES,
     RESAMPLES,
     TRACK,
-    Score,
-    abstention_rows,
     abstentions,
     compare,
     layout_names,
+    points_text,
     rate,
+    rate_of,
     score,
     step_times,
 )
 from vap_core.study.store import key_of, read, read_manifest
+from vap_core.study.table import percent, percent_interval, printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,215 +77,119 @@ def suites_table() -> str:
 
     Raises: BadSuite for a damaged list.
     """
-    notes = "\n".join([MATCHED, *_development_lists(), *_warm_ups()])
-    parts = [align(_track_rows()), align(_task_rows()), notes]
-    return "\n\n".join(parts)
-
-
-def _track_rows() -> list[list[str]]:
-    rows = [
-        ["suite", "robot", "cameras", "Hz", "control", "track", "episodes", "sha256 of the list"]
-    ]
+    tracks, tasks = [], []
     for name, suite in LISTED.items():
-        columns = [name, suite.robot, " ".join(suite.cameras), f"{suite.hz:g}", suite.control]
-        digest = suites.lists.digest(name)[:12]
-        tracks = Counter(row.split for row in suites.lists.read(name))
-        for split, count in tracks.items():
-            rows.append([*columns, split or "-", str(count), digest])
-    return rows
-
-
-def _task_rows() -> list[list[str]]:
-    rows = [["suite", "task", "instruction", "success when", "max steps", "episodes"]]
-    for name, suite in LISTED.items():
+        about = dict(suite=name, robot=suite.robot, cameras=" ".join(suite.cameras), Hz=suite.hz)
+        about |= dict(control=suite.control)
+        for split, count in Counter(row.split for row in suites.lists.read(name)).items():
+            digest = {"sha256 of the list": suites.lists.digest(name)[:12]}
+            tracks.append({**about, "track": split or "-", "episodes": count, **digest})
         for task in suite.tasks:
             listed = suites.rows(name, task.name)
+            rules = " and ".join(listed[0].at(stage).rule for stage in range(listed[0].stages))
             counts = Counter(row.split for row in listed).values()
-            rows.append(
-                [
-                    name,
-                    task.name,
-                    task.instruction,
-                    " and ".join(_rules(listed[0])),
-                    str(task.max_steps),
-                    " + ".join(map(str, counts)),
-                ]
-            )
-    return rows
-
-
-def _rules(row: EpisodeRow) -> list[str]:
-    """The rule of every sub-goal in order."""
-    return [row.at(stage).rule for stage in range(row.stages)]
-
-
-def _development_lists() -> list[str]:
-    counts = []
-    for name in suites.BENCHMARKS:
-        counts.append(f"{name}-dev {len(suites.benchmark(f'{name}-dev'))}")
-    return [
-        f"to tune on, other layouts and objects: {', '.join(counts)}",
+            line = {"suite": name, "task": task.name, "instruction": task.instruction}
+            line |= {"success when": rules, "max steps": task.max_steps}
+            tasks.append({**line, "episodes": " + ".join(map(str, counts))})
+    development = [
+        f"{name}-dev {len(suites.benchmark(f'{name}-dev'))}" for name in suites.BENCHMARKS
+    ]
+    notes = [
+        MATCHED,
+        f"to tune on, other layouts and objects: {', '.join(development)}",
         "with -absent after its name, a suite of these is the same without the target",
     ]
-
-
-def _warm_ups() -> list[str]:
-    lines = []
     for name, suite in suites.WARM_UPS.items():
-        lines.append(
+        notes.append(
             f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of "
             f"{suite.tasks[0].max_steps} steps, any number of episodes"
         )
-    return lines
+    return "\n\n".join([*map(_lines, (tracks, tasks)), "\n".join(notes)])
 
 
-Row = list[str]
+def _lines(lines: Sequence[Mapping[str, Any]]) -> str:
+    import pandas as pd
+
+    return printed(pd.DataFrame(list(lines)))
 
 
-def result_rows(lines: "pd.DataFrame", published: "pd.DataFrame") -> list[Row]:
-    """The results of one track, a block per task with methods as rows.
+def rates_in(lines: "pd.DataFrame", name: str) -> list[str]:
+    """A rate of `results` with its interval, in percent."""
+    columns = (lines[name], lines[f"{name}_low"], lines[f"{name}_high"])
+    return [percent_interval(*each) for each in zip(*columns, strict=True)]
+
+
+def result_table(lines: "pd.DataFrame", published: "pd.DataFrame") -> "pd.DataFrame":
+    """The results of one track to print, a block per task with methods as rows.
 
     `lines` are of `results.results`, `published` of `paper.main_results`. The paper's methods that
     were not run stand below ours.
     """
-    with_layouts = bool(lines["sr_layout_low"].notna().any())
-    with_paper = len(published) > 0
-    rows = [_result_head(with_layouts, with_paper)]
-    for task in dict.fromkeys(lines["task"]):
-        ours = lines[lines["task"] == task]
-        for line in ours.itertuples():
-            rows.append(_result_cells(line, with_layouts, with_paper))
-        theirs = published[published["task"] == task]
-        for line in theirs[~theirs["method"].isin(ours["method"])].itertuples():
-            blank = ["-"] * (len(rows[0]) - 4)
-            rows.append([task, *blank, line.paper_method, percent(line.sr), percent(line.cmr)])
-    return rows
+    import pandas as pd
+
+    n = lines["n"].astype(str) + " of " + lines["listed"].astype(str)
+    seeds = " (" + lines["seeds"].astype(str) + " seeds)"
+    table = lines[["task"]].assign(
+        method=lines["method"] + lines["bound"].map({True: " (bound)", False: ""}),
+        policy=lines["policy"],
+        n=n + seeds.where(lines["seeds"] > 1, ""),
+        layouts=lines["layouts"],
+        errors=lines["errors"],
+    )
+    table["SR % [95 %]"] = rates_in(lines, "sr")
+    if lines["sr_layout_low"].notna().any():
+        ends = zip(lines["sr_layout_low"], lines["sr_layout_high"], strict=True)
+        texts = [percent_interval(0.0, *each).removeprefix("0.0 ") for each in ends]
+        table["over layouts"] = texts
+    table["CMR % [95 %]"] = rates_in(lines, "cmr")
+    table["wrong object % [95 %]"] = rates_in(lines, "wrong_object")
+    if published.empty:
+        return table
+    columns = {"paper_method": "paper's row", "paper_sr": "paper SR", "paper_cmr": "paper CMR"}
+    table[list(columns.values())] = lines[list(columns)]
+    ran = pd.MultiIndex.from_frame(lines[["task", "method"]])
+    others = published[~pd.MultiIndex.from_frame(published[["task", "method"]]).isin(ran)]
+    names = {"paper_method": "paper's row", "sr": "paper SR", "cmr": "paper CMR"}
+    below = others.drop(columns="method").rename(columns=names)[["task", *names.values()]]
+    whole = pd.concat([table.astype(object), below.astype(object)], ignore_index=True)
+    for name in ("paper SR", "paper CMR"):
+        whole[name] = whole[name].map(percent)
+    tasks = list(dict.fromkeys(lines["task"]))
+    whole = whole[whole["task"].isin(tasks)]
+    return whole.sort_values("task", key=lambda task: task.map(tasks.index), kind="stable")
 
 
-def outcome_rows(ends: "pd.DataFrame") -> list[Row]:
-    """How many episodes were asked for, and how they ended (`results.outcomes`)."""
-    rows = [
-        [
-            "suite",
-            "method",
-            "policy",
-            "in the list",
-            "asked for",
-            "run",
-            "success",
-            "failure",
-            "error",
-            "run more than once",
-            "most attempts",
-        ]
+def outcome_table(ends: "pd.DataFrame") -> "pd.DataFrame":
+    """How many episodes were asked for, and how they ended (`results.outcomes`), to print."""
+    kept = ends.assign(
+        **{
+            name: ends[name].map(lambda n: "not kept" if n != n else f"{n:.0f}")
+            for name in ("retried", "most_attempts")
+        }
+    )
+    names = {"listed": "in the list", "asked": "asked for", "retried": "run more than once"}
+    return kept.rename(columns={**names, "most_attempts": "most attempts"})
+
+
+def comparison_table(compared: "pd.DataFrame") -> "pd.DataFrame":
+    """Pairs of methods on the same episodes (`stats.compare`) to print."""
+    table = compared[["task"]].assign(
+        suite=list(map(track_title, compared["suite"], compared["split"])),
+        method=compared["other"],
+        against=compared["one"],
+        policy=compared["policy"],
+        pairs=compared["pairs"],
+        layouts=compared["layouts"],
+    )
+    table["only it"], table["only the other"] = compared["only_other"], compared["only_one"]
+    table["difference [95 %]"] = [
+        "-" if line.low != line.low else points_text(line, digits=1)
+        for line in compared.itertuples()
     ]
-    for line in ends.itertuples():
-        counts = (line.listed, line.asked, line.run, line.success, line.failure, line.error)
-        attempts = [_attempts(line.retried), _attempts(line.most_attempts)]
-        rows.append([line.suite, line.method, line.policy, *map(str, counts), *attempts])
-    return rows
-
-
-def comparison_rows(compared: "pd.DataFrame") -> list[Row]:
-    """Pairs of methods on the same episodes (`results.comparisons`)."""
-    rows = [
-        [
-            "suite",
-            "task",
-            "method",
-            "against",
-            "policy",
-            "pairs",
-            "layouts",
-            "only it",
-            "only the other",
-            "difference [95 %]",
-            "p McNemar",
-            "p layouts",
-            "p Holm",
-        ]
-    ]
-    for line in compared.itertuples():
-        track = track_title(line.suite, line.split)
-        counts = (line.pairs, line.layouts, line.only_other, line.only_one)
-        rows.append(
-            [
-                *(track, line.task, line.other, line.one, line.policy),
-                *map(str, counts),
-                _difference(line),
-                *(_p_value(line.p_mcnemar), _p_value(line.p), _p_value(line.p_holm)),
-            ]
-        )
-    return rows
-
-
-def percent(fraction: float) -> str:
-    """A fraction as percent without the sign, "-" where it is not defined."""
-    if fraction != fraction:
-        return "-"
-    return f"{100 * fraction:.1f}"
-
-
-def percent_interval(middle: float, low: float, high: float) -> str:
-    """A fraction and its interval as percent without the sign, "-" where it is not defined."""
-    if low != low:
-        return "-"
-    return f"{100 * middle:.1f} {_interval(low, high)}"
-
-
-def _result_head(with_layouts: bool, with_paper: bool) -> Row:
-    head = ["task", "method", "policy", "n", "layouts", "errors", "SR % [95 %]"]
-    if with_layouts:
-        head.append("over layouts")
-    head += ["CMR % [95 %]", "wrong object % [95 %]"]
-    if with_paper:
-        head += ["paper's row", "paper SR", "paper CMR"]
-    return head
-
-
-def _result_cells(line: Any, with_layouts: bool, with_paper: bool) -> Row:
-    method = line.method
-    n = f"{line.n} of {line.listed}"
-    if line.bound:
-        method += " (bound)"
-    if line.seeds > 1:
-        n += f" ({line.seeds} seeds)"
-    cells = [line.task, method, line.policy, n, str(line.layouts), str(line.errors)]
-    cells.append(percent_interval(line.sr, line.sr_low, line.sr_high))
-    if with_layouts:
-        cells.append(_interval(line.sr_layout_low, line.sr_layout_high))
-    cells.append(percent_interval(line.cmr, line.cmr_low, line.cmr_high))
-    cells.append(percent_interval(line.wrong_object, line.wrong_object_low, line.wrong_object_high))
-    if with_paper and isinstance(line.paper_method, str):
-        cells += [line.paper_method, percent(line.paper_sr), percent(line.paper_cmr)]
-    elif with_paper:
-        cells += ["-", "-", "-"]
-    return cells
-
-
-def _interval(low: float, high: float) -> str:
-    if low != low:
-        return "-"
-    return f"[{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def _difference(line: Any) -> str:
-    """The points between two methods, "-" where they are not defined."""
-    if line.low != line.low:
-        return "-"
-    return signed_interval(100 * line.difference, 100 * line.low, 100 * line.high, digits=1)
-
-
-def _attempts(count: float) -> str:
-    if count != count:
-        return "not kept"
-    return f"{count:.0f}"
-
-
-def _p_value(p: float) -> str:
-    if p < 0.001:
-        return "< 0.001"
-    return f"{p:.3f}"
+    names = {"p_mcnemar": "p McNemar", "p": "p layouts", "p_holm": "p Holm"}
+    for column, name in names.items():
+        table[name] = compared[column].map(lambda p: "< 0.001" if p < 0.001 else f"{p:.3f}")
+    return table[["suite", *table.columns.drop("suite")]]
 
 
 RESULTS_NOTE = (
@@ -322,14 +225,118 @@ FAILURES_NOTE = (
     "`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; "
     "runs older than the diagnosis are left out."
 )
-
 ABSTENTION_NOTE = (
     "If the robot did not act where the vote's margin at t = 0, the least of all views, is below a "
     "threshold. The episodes without a target are those of NAME-absent."
 )
 
 
-def opening_section(runs: Runs) -> str:
+def report(sources: Sequence[Path], out: Path) -> str:
+    """Write report.md and report.html, its tables as CSV, forest.png and paired.png.
+
+    Returns report.md.
+
+    `sources` are run folders or published tables. An unfinished run is reported as it is, and
+    marked. Rates in the CSV tables are fractions, as the names of their columns say.
+
+    Raises: BadOutput for a run that is damaged or an `out` that cannot be written.
+    """
+    runs = load_runs(sources)
+    lines = results(runs)
+    ends = outcomes(runs)
+    origins = provenance(runs)
+    compared = compare(runs.table, runs.methods)
+    text = "\n\n".join(
+        [
+            "# Report",
+            _opening(runs),
+            *_results_section(lines, paper_results(runs)),
+            *_outcomes_section(runs, ends),
+            *_failures_section(runs),
+            *_comparisons_section(compared),
+            *_abstention_section(runs),
+            *_pictures_section(with_differences=len(compared) > 0),
+            *_provenance_section(origins),
+        ]
+    )
+    rates = [f"{name}{part}" for name in RATES for part in ("", "_low", "_high")]
+    rates += ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
+    figures = {"forest.png": forest(lines)}
+    by_track = {
+        track_title(str(suite), str(split)): result_table(part, lines.iloc[:0])
+        for (suite, split), part in lines.groupby(TRACK, sort=False)
+    }
+    files = {
+        "report.md": f"{text}\n",
+        "results.csv": _csv(lines, rates),
+        "outcomes.csv": _csv(ends),
+        "provenance.csv": _csv(origins),
+        "report.html": report_page(
+            runs.table,
+            {"Results": by_track, "Outcomes": {"": outcome_table(ends)}},
+            figures["forest.png"],
+            sources,
+            out,
+        ),
+    }
+    if len(compared):
+        files["comparisons.csv"] = _csv(compared, ["difference", "low", "high"])
+        figures["paired.png"] = differences(compared[compared["one"] == compared["one"].iloc[0]])
+    with writing(out, "report", "choose another folder with --out"):
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            write_atomic(out / name, content.encode())
+        for name, figure in figures.items():
+            write_png(figure, out / name)
+        for name in ("paired.png", "comparisons.csv"):  # of an earlier report
+            if name not in files and name not in figures:
+                (out / name).unlink(missing_ok=True)
+    return text
+
+
+def _csv(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:
+    """A table as CSV; the names of columns that hold fractions end with "_fraction"."""
+    return printed(table.rename(columns={name: f"{name}_fraction" for name in fractions}), "csv")
+
+
+def forest(lines: "pd.DataFrame") -> "Figure":
+    """Success rates of every suite, track and task of `results`, a mark per method and policy;
+    intervals are over layouts where layouts return.
+    """
+    shown = lines[lines["n"] > 0]
+    shown = shown.assign(
+        track=list(map(track_title, shown["suite"], shown["split"])),
+        value=shown["sr"],
+        low=shown["sr_layout_low"].fillna(shown["sr_low"]),
+        high=shown["sr_layout_high"].fillna(shown["sr_high"]),
+    )
+    several = shown.groupby("suite")["policy"].nunique().max() > 1
+    policy = "policy" if several else ""
+    return charts.dots(shown, "task", group="track", series="method", policy=policy)
+
+
+def differences(compared: "pd.DataFrame", line: str = "task") -> "Figure":
+    """Differences of success on the same episodes with their 95 % cluster bootstrap, a mark per
+    pair of methods, filled where Holm's p is below 0.05.
+    """
+    shown = compared.assign(
+        track=list(map(track_title, compared["suite"], compared["split"])),
+        value=compared["difference"],
+        filled=compared["p_holm"] < 0.05,
+    )
+    if compared.groupby("suite")["policy"].nunique().max() > 1:
+        shown["track"] += ", " + shown["policy"] + " policy"
+    label = (
+        f"points of success above {', '.join(dict.fromkeys(compared['one']))}, same episodes, "
+        "95 % interval over layouts\nfilled: p < 0.05 after Holm's correction"
+    )
+    least = min(-25.0, 100 * float(compared["low"].min()) - 2)
+    return charts.dots(
+        shown, line, group="track", series="other", label=label, limits=(least, 104.0)
+    )
+
+
+def _opening(runs: Runs) -> str:
     """How many episodes there are, which runs are unfinished, and in what they differ."""
     several = "s" if len(runs.manifests) > 1 else ""
     lines = [
@@ -341,84 +348,72 @@ def opening_section(runs: Runs) -> str:
     return "\n".join(lines)
 
 
-def results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> str:
-    """A table per track, and footnotes to the paper's numbers per suite.
-
-    `published` is of `results.paper_results`.
-
-    Raises: BadOutput, as `paper.ledger`.
-    """
+def _results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> list[str]:
     parts = ["## Results", RESULTS_NOTE]
     for suite, of_suite in lines.groupby("suite", sort=False):
         for (_, split), part in of_suite.groupby(TRACK, sort=False):
             of_track = (published["suite"] == suite) & (published["split"] == split)
             parts.append(f"### {track_title(str(suite), str(split))}")
-            rows = result_rows(part, published[of_track])
-            parts.append(markdown(rows))
+            parts.append(printed(result_table(part, published[of_track]), "markdown"))
         notes = paper.footnotes(str(suite))
         if suite == "tabletop":
             notes = [paper.real_arm(), *notes]
         if notes:
-            numbered = []
-            for i, note in enumerate(notes, 1):
-                numbered.append(f"{i}. {note}")
-            parts.append("Footnotes to the paper's numbers:\n\n" + "\n".join(numbered))
-    return "\n\n".join(parts)
+            numbered = "\n".join(f"{i}. {note}" for i, note in enumerate(notes, 1))
+            parts.append(f"Footnotes to the paper's numbers:\n\n{numbered}")
+    return parts
 
 
-def outcomes_section(runs: Runs, ends: "pd.DataFrame") -> str:
-    parts = ["## Outcomes", markdown(outcome_rows(ends))]
-    lines = errors(runs)
-    if lines:
-        listed = "\n".join(f"- {line}" for line in lines)
-        parts.append(f"Errors, by the last line of their tracebacks:\n{listed}")
-    return "\n\n".join(parts)
+def _outcomes_section(runs: Runs, ends: "pd.DataFrame") -> list[str]:
+    parts = ["## Outcomes", printed(outcome_table(ends), "markdown")]
+    listed = "\n".join(f"- {line}" for line in errors(runs))
+    return [*parts, f"Errors, by the last line of their tracebacks:\n{listed}"] if listed else parts
 
 
-def failures_section(runs: Runs) -> str:
+def _failures_section(runs: Runs) -> list[str]:
     """How the failures divide into cases; empty for runs that are older than the diagnosis."""
     if "case" not in runs.table:
-        return ""
+        return []
     counts = breakdown(runs.table)
     sub_cases = "- " + sub_cases_text(counts).replace("\n", "\n- ")
-    parts = ["## Why episodes failed", FAILURES_NOTE, markdown(breakdown_rows(counts)), sub_cases]
-    return "\n\n".join(parts)
+    table = printed(breakdown_table(counts), "markdown")
+    return ["## Why episodes failed", FAILURES_NOTE, table, sub_cases]
 
 
-def comparisons_section(compared: "pd.DataFrame") -> str:
+def _comparisons_section(compared: "pd.DataFrame") -> list[str]:
     title = "## Methods compared"
     if compared.empty:
-        return f"{title}\n\nNo two methods ran the same episodes under one policy."
-    return "\n\n".join([title, COMPARISONS_NOTE, markdown(comparison_rows(compared))])
+        return [title, "No two methods ran the same episodes under one policy."]
+    return [title, COMPARISONS_NOTE, printed(comparison_table(compared), "markdown")]
 
 
-def pictures_section(with_differences: bool) -> str:
-    parts = ["## Pictures", "![Success rates with 95 % intervals](forest.png)"]
-    if with_differences:
-        parts.append("![Differences from the first method on the same episodes](paired.png)")
-    return "\n\n".join(parts)
-
-
-def provenance_section(origins: "pd.DataFrame") -> str:
-    """A line per run (`provenance.provenance`), and its command."""
-    lines = []
-    for line in origins.to_dict("records"):
-        parts = []
-        for name in ("digest", "version", "seed", "policy"):
-            parts.append(f"{name} {line[name]}")
-        for name in ("stack", "robots", "world", "weights", "lists"):
-            if line[name]:
-                parts.append(f"{name} {line[name]}")
-        lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
-    return "## Provenance\n\n" + "\n".join(lines)
-
-
-def abstention_section(runs: Runs) -> str:
+def _abstention_section(runs: Runs) -> list[str]:
     """Success against coverage; empty where no suite was run with and without its targets."""
     found = abstentions(runs.table)
-    if not found:
-        return ""
-    return f"## Abstention\n\n{ABSTENTION_NOTE}\n\n{markdown(abstention_rows(found))}"
+    if found.empty:
+        return []
+    return ["## Abstention", ABSTENTION_NOTE, printed(found, "markdown")]
+
+
+def _pictures_section(with_differences: bool) -> list[str]:
+    parts = ["## Pictures", "![Success rates with 95 % intervals](forest.png)"]
+    paired = "![Differences from the first method on the same episodes](paired.png)"
+    return [*parts, paired] if with_differences else parts
+
+
+def _provenance_section(origins: "pd.DataFrame") -> list[str]:
+    """A line per run (`provenance`), and its command."""
+    lines = []
+    for line in origins.to_dict("records"):
+        told = ("digest", "version", "seed", "policy", "stack", "robots", "world")
+        always = told[:4]
+        parts = [
+            f"{name} {line[name]}"
+            for name in (*told, "weights", "lists")
+            if line[name] or name in always
+        ]
+        lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
+    return ["## Provenance", "\n".join(lines)]
 
 
 MOST_FAILURES = 24
@@ -438,49 +433,36 @@ h3{font-size:14px;margin:6px 0 2px}.wide{overflow-x:auto}
 
 def report_page(
     table: "pd.DataFrame",
-    tables: Mapping[str, Mapping[str, Rows]],
+    tables: "Mapping[str, Mapping[str, pd.DataFrame]]",
     forest: "Figure",
     sources: Sequence[Path],
     out: Path,
 ) -> str:
     """The page that stands in the folder `out`.
 
-    `table` has one row per episode, `tables` the rows of the report's tables by section and title;
-    `sources` are the runs, whose recordings give the pictures of failures.
+    `table` has one row per episode, `tables` are the report's by section and title; `sources` are
+    the runs, whose recordings give the pictures of failures.
     """
+    methods = ", ".join(dict.fromkeys(table["method"]))
+    won = int(table["outcome"].eq("success").sum())
+    about = f"{len(table)} episodes, {won} of them successes; methods: {methods}."
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Report</title>",
         f"<style>{STYLE}</style></head><body><h1>Report</h1>",
-        f"<p>{escape(_summary(table))}</p>",
+        f"<p>{escape(about)}</p>",
         _picture(forest, "success rates with 95 % intervals"),
     ]
     for section, by_title in tables.items():
         parts.append(f"<h2>{escape(section)}</h2>")
-        for title, rows in by_title.items():
-            if title:
-                parts.append(f"<h3>{escape(title)}</h3>")
-            parts.append(_html_table(rows))
+        for title, shown in by_title.items():
+            parts += [f"<h3>{escape(title)}</h3>"] if title else []
+            parts.append(printed(shown, "html"))
     if set(DIAGNOSIS_COLUMNS) <= set(table.columns):
         parts.append("<h2>Where episodes are lost</h2>")
-        parts.append(_picture(_funnel(table), "episodes that are left after each stage"))
+        funnel = charts.funnel(funnel_table(table))
+        parts.append(_picture(funnel, "episodes that are left after each stage"))
         parts += _failures(table, sources, out)
-    parts.append("</body></html>\n")
-    return "\n".join(parts)
-
-
-def _summary(table: "pd.DataFrame") -> str:
-    n = len(table)
-    won = int(table["outcome"].eq("success").sum())
-    methods = ", ".join(dict.fromkeys(table["method"]))
-    return f"{n} episodes, {won} of them successes; methods: {methods}."
-
-
-def _funnel(table: "pd.DataFrame") -> "Figure":
-    names = list(dict.fromkeys(table["method"]))
-    colours = {name: colour for name, (colour, _) in method_marks(names).items()}
-    known = [name for name in METHODS if name in colours]
-    order = [*known, *(name for name in names if name not in known)]
-    return funnel_figure(funnel_table(table), {name: colours[name] for name in order})
+    return "\n".join([*parts, "</body></html>\n"])
 
 
 def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list[str]:
@@ -489,25 +471,22 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     Failures that were not diagnosed have none and are counted.
     """
     known = diagnosed(table)
-    failed = known[known["outcome"].eq("failure")]
     order = ["suite", "case", "sub_case", "method", "task", "episode"]
-    failed = failed.sort_values(order, kind="stable")
+    failed = known[known["outcome"].eq("failure")].sort_values(order, kind="stable")
     rows = failed.to_dict("records")
     parts = [f"<h2>Failures ({len(rows)})</h2>"]
     older = int(table["outcome"].eq("failure").sum()) - len(rows)
     if older:
         parts.append(f"<p>{older_text(older)}.</p>")
-    pictured: list[str] = []
     with closing(_recorded(rows, sources)) as recorded:
-        for row, recording in islice(recorded, MOST_FAILURES):
-            pictured.append(_card(row, recording, out))
-    if pictured:
-        parts.append(f"<div class='failures'>{''.join(pictured)}</div>")
-    left = len(rows) - len(pictured)
-    if left:
+        cards = [_card(row, path, out) for row, path in islice(recorded, MOST_FAILURES)]
+    if cards:
+        parts.append(f"<div class='failures'>{''.join(cards)}</div>")
+    if len(rows) > len(cards):
         parts.append(
-            f"<p>{left} more without a picture here: <code>python -m vap_core diagnose RUN</code> "
-            "lists all of them, and records what was not recorded.</p>"
+            f"<p>{len(rows) - len(cards)} more without a picture here: "
+            "<code>python -m vap_core diagnose RUN</code> lists all of them, and records what was "
+            "not recorded.</p>"
         )
     return parts
 
@@ -539,26 +518,29 @@ def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
     words = f"{row['case'].capitalize()} · {row['sub_case']}"
     about = f"{row['suite']} · {row['task']} · episode {row['episode']} · {row['method']}"
     link = quote(os.path.relpath(recording, out).replace(os.sep, "/"))
-    images = []
-    for camera, rgb in _views(recording, frame).items():
-        images.append(f"<img alt='{escape(camera)}' title='{escape(camera)}' src='{_jpeg(rgb)}'>")
+    shown = ""
+    try:
+        for camera, rgb in _views(recording, frame).items():
+            name = escape(camera)
+            shown += f"<img alt='{name}' title='{name}' src='{_jpeg(rgb)}'>"
+    except BaseException as error:  # decoders of a damaged file raise anything, or panic
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
+        shown = f"<em>its pictures cannot be read ({escape(type(error).__name__)})</em>"
     look = command("view", recording, "--frame", str(frame))
     return (
         f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
-        f"<div>{''.join(images)}</div><p>{escape(str(row['case_sentence']))}</p>"
+        f"<div>{shown}</div><p>{escape(str(row['case_sentence']))}</p>"
         f"<a href='{link}'>recording</a>, frame {frame}: <code>{escape(look)}</code></article>"
     )
 
 
 def _views(recording: Path, frame: int) -> "dict[str, Rgb]":
-    """What the policy saw last at a frame, by camera; nothing from a file that is damaged."""
+    """What the policy saw last at a frame, by camera."""
     from vap_core.recording.read import prompted_entities, read_pictures
 
-    try:
-        entities = prompted_entities(recording)
-        pictures = read_pictures(recording, set(entities.values()))
-    except (BadRecording, RuntimeError, ValueError, OSError):
-        return {}
+    entities = prompted_entities(recording)
+    pictures = read_pictures(recording, set(entities.values()))
     views = {}
     for camera, entity in entities.items():
         before = [step for step in pictures[entity] if step <= frame]
@@ -584,126 +566,21 @@ def _picture(figure: "Figure", words: str) -> str:
     return f"<img alt='{escape(words)}' src='data:image/png;base64,{inside}'>"
 
 
-def _html_table(rows: Rows) -> str:
-    """The first row is the head."""
-    lines = []
-    for i, row in enumerate(rows):
-        tag = "td" if i else "th"
-        cells = "".join(f"<{tag}>{escape(str(cell))}</{tag}>" for cell in row)
-        lines.append(f"<tr>{cells}</tr>")
-    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
-
-
-COMPARISON_FILES = ("paired.png", "comparisons.csv")
-"""What only a report that compares methods has."""
-
-
-def report(sources: Sequence[Path], out: Path) -> str:
-    """Write report.md and report.html, its tables as CSV, forest.png and paired.png.
-
-    Returns report.md.
-
-    `sources` are run folders or published tables. An unfinished run is reported as it is, and
-    marked. Rates in the CSV tables are fractions, as the names of their columns say.
-
-    Raises: BadOutput for a run that is damaged or an `out` that cannot be written.
-    """
-    runs = load_runs(sources)
-    lines = results(runs)
-    published = paper_results(runs)
-    ends = outcomes(runs)
-    origins = provenance(runs)
-    compared = compare(runs.table, runs.methods)
-    differences = comparisons(compared)
-    parts = [
-        "# Report",
-        opening_section(runs),
-        results_section(lines, published),
-        outcomes_section(runs, ends),
-        failures_section(runs),
-        comparisons_section(differences),
-        abstention_section(runs),
-        pictures_section(with_differences=bool(compared)),
-        provenance_section(origins),
-    ]
-    text = "\n\n".join(filter(None, parts))
-    files = {
-        "report.md": f"{text}\n",
-        "results.csv": _csv_text(lines, fractions=_rate_columns()),
-        "outcomes.csv": _csv_text(ends),
-        "provenance.csv": _csv_text(origins),
-    }
-    figures = {"forest.png": forest_figure(lines)}
-    files["report.html"] = report_page(
-        table=runs.table,
-        tables={
-            "Results": _rows_by_track(lines),
-            "Outcomes": {"": outcome_rows(ends)},
-        },
-        forest=figures["forest.png"],
-        sources=sources,
-        out=out,
-    )
-    if compared:
-        files["comparisons.csv"] = _csv_text(differences, fractions=["difference", "low", "high"])
-        against_first = [c for c in compared if c.one == compared[0].one]
-        figures["paired.png"] = differences_figure(against_first)
-    _write(out, files, figures)
-    return text
-
-
-def _rows_by_track(lines: "pd.DataFrame") -> dict[str, list[list[str]]]:
-    """The rows of results of each suite and track, by its title."""
-    rows = {}
-    for (suite, split), part in lines.groupby(["suite", "split"], sort=False):
-        rows[track_title(str(suite), str(split))] = result_rows(part, lines.iloc[:0])
-    return rows
-
-
-def _csv_text(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:
-    """A table as CSV; the names of columns that hold fractions end with "_fraction"."""
-    names = {}
-    for name in fractions:
-        names[name] = f"{name}_fraction"
-    return table.rename(columns=names).to_csv(index=False)
-
-
-def _rate_columns() -> list[str]:
-    """The columns of `results.results` that hold fractions."""
-    columns = ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
-    for name in RATES:
-        columns.append(name)
-        columns += [f"{name}_low", f"{name}_high"]
-    return columns
-
-
-def _write(out: Path, files: dict[str, str], figures: "dict[str, Figure]") -> None:
-    """Write a report, and remove the comparisons of an earlier one that this one has not."""
-    with writing(out, "report", "choose another folder with --out"):
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            write_atomic(out / name, content.encode())
-        for name, figure in figures.items():
-            write_png(figure, out / name)
-        for name in COMPARISON_FILES:
-            if name not in files and name not in figures:
-                (out / name).unlink(missing_ok=True)
-
-
 def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     """Write `summary.json` and `figure.png` into the run's folder, and return the text to print.
 
     Raises: BadOutput.
     """
     scores = ordered(score(table), study.tasks, study.methods)
-    summary = folder / "summary.json"
-    figure = folder / "figure.png"
-    lines = []
-    for each in scores:
-        lines.append({**each.to_json(), "seed": study.seed, "seeds": study.seeds})
+    summary, figure = folder / "summary.json", folder / "figure.png"
+    lines = [
+        {**to_json(line), "seed": study.seed, "seeds": study.seeds}
+        for line in scores.to_dict("records")
+    ]
     with writing(folder, "conclude"):
         write_atomic(summary, json.dumps(lines, indent=1).encode())
-        write_png(forest_figure(scores_table(scores)), figure)
+        nothing = dict.fromkeys(("sr_layout_low", "sr_layout_high"), float("nan"))
+        write_png(forest(scores.assign(**nothing)), figure)
     text = [
         results_table(scores),
         *_totals(scores),
@@ -712,77 +589,66 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
         "time per control step, ms by part:",
         _times_table(scores, table),
         "",
-        *_written(study, folder, f"wrote {summary}, {figure}"),
     ]
+    written = f"wrote {summary}, {figure}"
+    recordings = sorted((folder / "recordings").glob("*.rrd"))
+    if recordings:
+        size_mb = sum(path.stat().st_size for path in recordings) / 1e6
+        written += f", {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}"
+        prompted = next((path for path in recordings if ".vap." in path.name), recordings[0])
+        written += f"\nlook at one: {study.next_command('view', prompted)}"
+    text.append(written)
     if table["outcome"].eq("failure").any():
         text.append(f"why they failed: {study.next_command('diagnose', folder)}")
     text.append(f"tables, paired tests, a page: {study.next_command('report', folder)}")
     return "\n".join(text)
 
 
-def results_table(scores: Sequence[Score]) -> str:
+def to_json(line: Mapping[Any, Any]) -> dict[str, Any]:
+    """A line of `score` as summary.json has it."""
+    kept = {name: line[name] for name in ("suite", "task", "split", "method", "policy")}
+    rates = {name: rate_of(line, name) for name in RATES}
+    values = {name: each.value if each.n else None for name, each in rates.items()}
+    bounds = {name: [each.low, each.high] if each.n else None for name, each in rates.items()}
+    counts = {"n": int(line["n"]), "errors": int(line["errors"])}
+    return {**kept, **counts, **values, "intervals": bounds}
+
+
+def results_table(scores: "pd.DataFrame") -> str:
     """Aligned text; every rate with its 95 % Wilson interval."""
-    rows = [
-        [
-            "suite",
-            "task",
-            "method",
-            "policy",
-            "n",
-            "errors",
-            "SR % [95 %]",
-            "CMR % [95 %]",
-            "wrong object % [95 %]",
-        ]
-    ]
-    for each in scores:
-        task = f"{each.task} ({each.split})" if each.split else each.task
-        counts = [str(each.n), str(each.errors)]
-        rates = [str(each.sr), str(each.cmr), str(each.wrong_object)]
-        rows.append([each.suite, task, each.method, each.policy, *counts, *rates])
-    return align(rows)
+    split = (" (" + scores["split"] + ")").where(scores["split"] != "", "")
+    table = scores[["suite"]].assign(task=scores["task"] + split)
+    table[["method", "policy", "n", "errors"]] = scores[["method", "policy", "n", "errors"]]
+    for name, title in (("sr", "SR"), ("cmr", "CMR"), ("wrong_object", "wrong object")):
+        rates = [rate_of(line, name) for line in scores.to_dict("records")]
+        table[f"{title} % [95 %]"] = rates
+    return printed(table)
 
 
 def ordered(
-    scores: Sequence[Score], tasks: Sequence[Sequence[str]], methods: Sequence[str]
-) -> list[Score]:
+    scores: "pd.DataFrame", tasks: Sequence[Sequence[str]], methods: Sequence[str]
+) -> "pd.DataFrame":
     """In the order in which a study names its tasks and methods."""
-    places: dict[tuple[str, str], int] = {}
-    for suite, task in tasks:
-        places.setdefault((suite, task), len(places))
-
-    def place(each: Score) -> tuple[int, int]:
-        return places[each.suite, each.task], methods.index(each.method)
-
-    return sorted(scores, key=place)
+    places = list(dict.fromkeys(map(tuple, tasks)))
+    names = list(zip(scores["suite"], scores["task"], strict=True))
+    order = scores.assign(_task=list(map(places.index, names)))
+    order["_method"] = scores["method"].map(list(methods).index)
+    return scores.loc[order.sort_values(["_task", "_method"], kind="stable").index]
 
 
-def _totals(scores: Sequence[Score]) -> list[str]:
-    """Success over all tasks of a track per method, where there are several.
-
-    Begins with an empty line.
-    """
-    by_track: dict[tuple[str, str, str], list[Score]] = {}
-    for each in scores:
-        by_track.setdefault((each.suite, each.split, each.method), []).append(each)
+def _totals(scores: "pd.DataFrame") -> list[str]:
+    """Success over all tasks of a track per method, where there are several."""
     lines = []
-    for (suite, split, method), part in by_track.items():
-        if len(part) == 1:
-            continue
-        k = n = 0
-        for each in part:
-            k += each.sr.k
-            n += each.n
-        total = rate(k, n)
-        least = min(part, key=lambda each: each.sr.value)
-        track = f"{suite} ({split})" if split else suite
-        lines.append(
-            f"{track} {method}: {total.k} of {total.n} succeed, SR {total}; least {least.task} "
-            f"{least.sr}"
-        )
-    if lines:
-        lines.insert(0, "")
-    return lines
+    for (suite, split, method), part in scores.groupby([*TRACK, "method"], sort=False):
+        if len(part) > 1:
+            total = rate(int(part["sr_k"].sum()), int(part["n"].sum()))
+            least = part.loc[part["sr"].idxmin()]
+            track = f"{suite} ({split})" if split else suite
+            lines.append(
+                f"{track} {method}: {total.k} of {total.n} succeed, SR {total}; least "
+                f"{least['task']} {rate_of(least)}"
+            )
+    return ["", *lines] if lines else []
 
 
 def _layouts_note(study: "Study", table: "pd.DataFrame", folder: Path) -> list[str]:
@@ -792,63 +658,33 @@ def _layouts_note(study: "Study", table: "pd.DataFrame", folder: Path) -> list[s
         return []
     layouts = placed["layout"].nunique()
     episodes = len(placed) // placed["method"].nunique()
-    command = study.next_command("report", folder)
-    return [
-        "",
-        f"{episodes} episodes a method on {layouts} layouts; for intervals over layouts: {command}",
-    ]
+    report = study.next_command("report", folder)
+    text = (
+        f"{episodes} episodes a method on {layouts} layouts; for intervals over layouts: {report}"
+    )
+    return ["", text]
 
 
-def _times_table(scores: Sequence[Score], table: "pd.DataFrame") -> str:
+def _times_table(scores: "pd.DataFrame", table: "pd.DataFrame") -> str:
     """Milliseconds of one control step by part, one row per suite and method."""
-    times: dict[tuple[str, str], Mapping[str, float]] = {}
-    for each in scores:
-        episodes = table[(table["suite"] == each.suite) & (table["method"] == each.method)]
-        times[each.suite, each.method] = step_times(episodes)
-    parts: dict[str, None] = {}
-    for times_ms in times.values():
-        parts |= dict.fromkeys(times_ms)
-    rows = [["suite", "method", *parts, "total"]]
-    for (suite, method), times_ms in times.items():
-        row = [suite, method]
-        for part in parts:
-            row.append(f"{times_ms.get(part, 0.0):.1f}")
-        total_ms = sum(times_ms.values())
-        rows.append([*row, f"{total_ms:.1f}"])
-    return align(rows)
+    lines = []
+    for suite, method in dict.fromkeys(zip(scores["suite"], scores["method"], strict=True)):
+        times = step_times(table[(table["suite"] == suite) & (table["method"] == method)])
+        about = {"suite": suite, "method": method}
+        lines.append({**about, **times, "total": sum(times.values())})
+    import pandas as pd
 
-
-def _written(study: "Study", folder: Path, written: str) -> list[str]:
-    """What was written, and how to look at a recording of a prompted episode."""
-    recordings = sorted((folder / "recordings").glob("*.rrd"))
-    if not recordings:
-        return [written]
-    size_mb = sum(path.stat().st_size for path in recordings) / 1e6
-    return [
-        f"{written}, {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}",
-        f"look at one: {study.next_command('view', _example(recordings))}",
-    ]
-
-
-def _example(recordings: Sequence[Path]) -> Path:
-    """The first recording of VAP, else the first of all."""
-    for path in recordings:
-        if ".vap." in path.name:
-            return path
-    return recordings[0]
+    found = pd.DataFrame(lines)
+    parts = [*found.columns.drop(["suite", "method", "total"]), "total"]
+    found[parts] = found[parts].fillna(0.0).map("{:.1f}".format)
+    return printed(found[["suite", "method", *parts]])
 
 
 RULED = (
-    "success",
-    "success_once",
-    "held_steps",
-    "cmr",
-    "wrong_object",
-    "first_object_correct",
+    *("success", "success_once", "held_steps", "cmr", "wrong_object", "first_object_correct"),
     "steps",
 )
 """The columns of a results table that the rules decide."""
-Key = tuple[Any, ...]
 NEEDED = {"lists", "tasks", "methods", "episodes", "seed", "seeds"}
 """What a run's configuration must hold."""
 
@@ -859,7 +695,12 @@ def rescore(folder: Path) -> str:
     Raises: BadOutput for a folder without results or configuration, or whose episode lists have
         changed since; BadSuite.
     """
-    stored = _stored_episodes(folder)
+    table = read(folder)
+    if table.empty:
+        raise BadOutput(
+            f"rescore: {folder} holds no results; name the folder that eval or rollout wrote."
+        )
+    stored = {key_of(row): row for row in table.to_dict("records")}
     study = _checked_configuration(folder)
     rows = _rows_by_key(study)
     judged: list[dict[str, Any]] = []
@@ -871,9 +712,9 @@ def rescore(folder: Path) -> str:
         suite, task, _, seed, episode = key
         outcome = _judge(rows[suite, task, seed, episode], truths)
         cells = {name: getattr(outcome, name) for name in RULED}
-        judged.append({**stored[key], "outcome": outcome.status, **cells})
-        del kept[key]
-        if _differs(stored[key], cells):
+        before = kept.pop(key)
+        judged.append({**before, "outcome": outcome.status, **cells})
+        if any(before[name] is not cell and before[name] != cell for name, cell in cells.items()):
             changed.append(" ".join(map(str, key)))
     scores = ordered(score([*judged, *kept.values()]), study["tasks"], study["methods"])
     verdict = f"{len(changed)} of {len(judged)} episodes judged differently"
@@ -881,19 +722,6 @@ def rescore(folder: Path) -> str:
         verdict += ": " + "; ".join(changed[:10])
     verdict += f"; {len(kept)} without a saved state or in error kept as they were."
     return f"{results_table(scores)}\n\n{verdict}"
-
-
-def _stored_episodes(folder: Path) -> dict[Key, dict[Any, Any]]:
-    """The rows of a run's table by their key (store.KEY)."""
-    table = read(folder)
-    if table.empty:
-        raise BadOutput(
-            f"rescore: {folder} holds no results; name the folder that eval or rollout wrote."
-        )
-    episodes: dict[Key, dict[Any, Any]] = {}
-    for row in table.to_dict("records"):
-        episodes[key_of(row)] = row
-    return episodes
 
 
 def _checked_configuration(folder: Path) -> dict[str, Any]:
@@ -912,29 +740,14 @@ def _checked_configuration(folder: Path) -> dict[str, Any]:
     return study
 
 
-def _rows_by_key(study: Mapping[str, Any]) -> dict[Key, EpisodeRow]:
+def _rows_by_key(study: Mapping[str, Any]) -> dict[tuple[Any, ...], EpisodeRow]:
     """The rows of a study's episode lists by suite, task, seed and episode."""
-    rows: dict[Key, EpisodeRow] = {}
-    for suite, task in study["tasks"]:
-        for row in suites.listed(
-            suite,
-            task,
-            n=study["episodes"],
-            seed=study["seed"],
-            seeds=study["seeds"],
-            own_target=study.get("object", ""),
-            split=study.get("split", ""),
-        ):
-            rows[row.suite, row.task, row.seed, row.episode] = row
-    return rows
+    more = {name: study[name] for name in ("seed", "seeds")} | {"n": study["episodes"]}
+    more |= {"own_target": study.get("object", ""), "split": study.get("split", "")}
+    listed = [row for suite, task in study["tasks"] for row in suites.listed(suite, task, **more)]
+    return {(row.suite, row.task, row.seed, row.episode): row for row in listed}
 
 
 def _judge(row: EpisodeRow, truths: list[Truth]) -> Outcome:
-    sizes_m = {}
-    for place in row.placements:
-        sizes_m[place.model] = extent_m(get_object(place.model))
+    sizes_m = {place.model: extent_m(get_object(place.model)) for place in row.placements}
     return rejudge(row, sizes_m, truths).outcome()
-
-
-def _differs(stored: Mapping[str, Any], cells: Mapping[str, Any]) -> bool:
-    return any(stored[name] is not cell and stored[name] != cell for name, cell in cells.items())

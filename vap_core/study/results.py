@@ -6,7 +6,7 @@ What is missing is counted, nothing is dropped. Rates and differences are fracti
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,26 +25,21 @@ from vap_core.study.stats import (
     RATES,
     SCORE_KEY,
     TRACK,
-    Comparison,
-    count,
-    intervals,
+    add_rate,
     layout_clusters,
     layout_interval,
     layout_names,
+    score,
 )
 from vap_core.study.store import KEY, ROW_KEY, encode_table, read, read_manifest
 from vap_core.study.trials import DEMO, Study, policy_today
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyarrow as pa
 
-TEXT_COLUMNS = ("suite", "task", "method", "policy", "outcome")
-OPTIONAL_TEXT_COLUMNS = ("split", "variant", "case", "sub_case", "detail")
-WHOLE_NUMBER_COLUMNS = ("seed", "episode", "steps")
-NUMBER_COLUMNS = ("attempt", "deciding_frame", "case_confidence")
-FLAG_COLUMNS = ("success", "success_once", "cmr", "wrong_object", "first_object_correct", "touched")
-"""True, False, or nothing."""
+    type Run = tuple[dict[str, Any], pd.DataFrame]
+    """A run's manifest and its episodes."""
+
 EXECUTED = "suite_files"
 """A study's files of own suites. They are the user's to name: none is taken from a file of results.
 """
@@ -54,24 +49,8 @@ NEEDED_SETTINGS = {"tasks", "methods", "episodes", "seed", "policy"}
 """What the configuration of a run of eval, rollout or demo holds."""
 
 
-def _is_whole_number(value: Any, end: int = LARGEST) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < end
-
-
-def _is_count(value: Any) -> bool:
-    return _is_whole_number(value) and value > 0
-
-
-def _is_seed(value: Any) -> bool:
-    return _is_whole_number(value, LARGEST_SEED)
-
-
-def _is_count_or_all(value: Any) -> bool:
-    return value is None or _is_count(value)
-
-
-def _is_temperature(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < LARGEST
+def _is_whole(value: Any, first: int = 0, end: int = LARGEST) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and first <= value < end
 
 
 def _is_text(value: Any) -> bool:
@@ -82,28 +61,20 @@ def _are_texts(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(map(_is_text, value))
 
 
-def _are_tasks(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and bool(value)
-        and all(_are_texts(pair) and len(pair) == 2 for pair in value)
-    )
-
-
-def _are_digests(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(_is_text, value.values()))
-
-
 SETTINGS: Mapping[str, Callable[[Any], bool]] = {
-    "tasks": _are_tasks,
+    "tasks": lambda tasks: (
+        isinstance(tasks, list)
+        and bool(tasks)
+        and all(_are_texts(pair) and len(pair) == 2 for pair in tasks)
+    ),
     "methods": _are_texts,
-    "episodes": _is_count_or_all,
-    "seed": _is_seed,
-    "seeds": _is_count,
+    "episodes": lambda n: n is None or _is_whole(n, 1),
+    "seed": lambda n: _is_whole(n, end=LARGEST_SEED),
+    "seeds": lambda n: _is_whole(n, 1),
     "policy": _is_text,
-    "temperature": _is_temperature,
+    "temperature": lambda x: isinstance(x, float) or _is_whole(x),
     "object": _is_text,
-    "lists": _are_digests,
+    "lists": lambda lists: isinstance(lists, dict) and all(map(_is_text, lists.values())),
 }
 """Settings of a study that are read back, and what they must be where they are there."""
 
@@ -118,15 +89,6 @@ def check_run(source: Path, manifest: Any, episodes: "pd.DataFrame") -> None:
         raise BadOutput(
             f"run: {source} is damaged: {wrong}; run the same command again with another --out, or "
             "publish the table anew."
-        )
-
-
-def require_episodes(source: Path, configuration: Mapping[str, Any], command: str) -> None:
-    """Raises: BadOutput for a run of another command than eval, rollout or demo."""
-    if not configuration.keys() >= NEEDED_SETTINGS:
-        raise BadOutput(
-            f"{command}: {source} holds no run of eval, rollout or demo; name the folder that one "
-            "of them wrote."
         )
 
 
@@ -147,27 +109,39 @@ def _wrong_setting(manifest: Any) -> str:
 def _wrong_column(episodes: "pd.DataFrame") -> str:
     from pandas.api.types import is_integer_dtype, is_numeric_dtype
 
-    for name in episodes.columns.intersection([*TEXT_COLUMNS, *OPTIONAL_TEXT_COLUMNS]):
-        kept = episodes[name]
-        if name in OPTIONAL_TEXT_COLUMNS:
-            kept = kept.dropna()
-        if not kept.map(_is_text).all():
-            return f"the column {name} holds what is no text"
-    for name in episodes.columns.intersection(WHOLE_NUMBER_COLUMNS):
-        if len(episodes) and not is_integer_dtype(episodes[name]):
-            return f"the column {name} holds what is no whole number"
-    for name in episodes.columns.intersection(NUMBER_COLUMNS):
-        if len(episodes) and not is_numeric_dtype(episodes[name]):
-            return f"the column {name} holds what is no number"
-    for name in episodes.columns.intersection(FLAG_COLUMNS):
-        if not episodes[name].dropna().isin([True, False]).all():
-            return f"the column {name} holds what is neither true nor false"
+    def is_flag(kept: "pd.Series") -> bool:
+        return bool(kept.dropna().isin([True, False]).all())
+
+    checks: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "text": (lambda kept: bool(kept.map(_is_text).all()), "suite task method policy outcome"),
+        "text, or nothing": (
+            lambda kept: bool(kept.dropna().map(_is_text).all()),
+            "split variant case sub_case detail",
+        ),
+        "whole numbers": (lambda kept: kept.empty or is_integer_dtype(kept), "seed episode steps"),
+        "numbers": (
+            lambda kept: kept.empty or is_numeric_dtype(kept),
+            "attempt deciding_frame case_confidence",
+        ),
+        "true or false": (
+            is_flag,
+            "success success_once cmr wrong_object first_object_correct touched",
+        ),
+    }
+    for kind, (fits, names) in checks.items():
+        for name in episodes.columns.intersection(names.split()):
+            if not fits(episodes[name]):
+                return f"the column {name} holds other than {kind}"
     return ""
 
 
-if TYPE_CHECKING:
-    type Run = tuple[dict[str, Any], pd.DataFrame]
-    """A run's manifest and its episodes."""
+def require_episodes(source: Path, configuration: Mapping[str, Any], command: str) -> None:
+    """Raises: BadOutput for a run of another command than eval, rollout or demo."""
+    if not configuration.keys() >= NEEDED_SETTINGS:
+        raise BadOutput(
+            f"{command}: {source} holds no run of eval, rollout or demo; name the folder that one "
+            "of them wrote."
+        )
 
 
 def read_published(path: Path) -> "list[Run]":
@@ -198,12 +172,23 @@ def read_published(path: Path) -> "list[Run]":
     return runs
 
 
+def read_runs(source: Path) -> "list[Run]":
+    """The run of a folder, or every run of a published table: its manifest, and its episodes.
+
+    Raises: BadOutput.
+    """
+    if source.suffix == ".parquet":
+        return read_published(source)
+    manifest = read_manifest(source)
+    episodes = read(source)
+    check_run(source, manifest, episodes)
+    return [(manifest, episodes)]
+
+
 def scene_of(study: Mapping[str, Any]) -> str:
     """What a configuration's scenes have beside what its lists say, in words."""
-    scene = f"{study.get('robots', 'plain')} robots"
-    if study.get("object"):
-        scene += f" and the object {study['object']}"
-    return scene
+    own = f" and the object {study['object']}" if study.get("object") else ""
+    return f"{study.get('robots', 'plain')} robots{own}"
 
 
 def require_same_scenes(
@@ -228,36 +213,14 @@ def require_same_scenes(
                 )
 
 
-def read_runs(source: Path) -> "list[Run]":
-    """The run of a folder, or every run of a published table: its manifest, and its episodes.
-
-    Raises: BadOutput.
-    """
-    if source.suffix == ".parquet":
-        return read_published(source)
-    manifest = read_manifest(source)
-    episodes = read(source)
-    check_run(source, manifest, episodes)
-    return [(manifest, episodes)]
-
-
 def publish(
-    sources: Sequence[Path],
-    target: Path,
-    *,
-    replace: bool = False,
-    supersede: bool = False,
-    suite_names: Sequence[str] = (),
-    methods: Sequence[str] = (),
+    sources: Sequence[Path], target: Path, *, replace: bool = False, methods: Sequence[str] = ()
 ) -> int:
     """Write every episode of the runs, with their manifests in the file's metadata.
 
     A source is a run's folder, or a table that `publish` wrote, whose runs are taken as they are.
-    Tracebacks, wall times and memory use are left out. With `supersede`, a method
-    that later sources have read again, for all the same episodes and with the same policy, leaves
-    the earlier source (`superseded` in its manifest). Of the runs only those of `suite_names`, and
-    of each only its `methods` (the others are `left_out` in its manifest, and may be unfinished),
-    are taken, where these are given.
+    Tracebacks, wall times and memory use are left out. Of each run only its `methods` (the others
+    are `left_out` in its manifest, and may be unfinished) are taken, where any are given.
 
     Returns: the number of episodes.
 
@@ -269,180 +232,72 @@ def publish(
 
     if target.suffix != ".parquet" or target.is_dir():
         raise BadOutput(f"publish: {target} is no name of a table; end it with .parquet.")
+    exists = BadOutput(
+        f"publish: {target} exists; choose another name with --to, or pass --replace."
+    )
     if target.exists() and not replace:
-        raise _exists(target)
-    runs: list[Run] = []
-    named = []
+        raise exists
+    runs: list[tuple[Path, dict[str, Any], pd.DataFrame]] = []
+    there: dict[str, None] = {}
     for source in sources:
         for manifest, episodes in read_runs(source):
             require_episodes(source, manifest["configuration"], "publish")
-            if not suite_names or _is_of(manifest, suite_names):
-                _require_finished(source, manifest, episodes, methods)
-                runs.append((manifest, episodes))
-                named.append((source, manifest))
-    require_same_scenes(named, "publish", "publish them in tables of their own")
-    if suite_names:
-        _require_whole(runs, suite_names)
-    if methods:
-        runs = _of_methods(runs, methods)
-    if supersede:
-        runs = _without_superseded(runs)
-    tables = []
-    for manifest, episodes in runs:
-        kept = episodes[_published_columns(episodes)].assign(configuration=manifest["digest"])
-        tables.append(pa.Table.from_pandas(kept, preserve_index=False))
-    manifests = [manifest for manifest, _ in runs]
-    whole = pa.concat_tables(tables, promote_options="permissive")
-    if whole.select([*KEY, "policy"]).to_pandas().duplicated().any():
-        raise BadOutput(
-            f"publish: two of {', '.join(map(str, sources))} hold the same episodes; name each run "
-            "once, or pass --supersede to keep the later ones."
-        )
-    metadata = {
-        **(whole.schema.metadata or {}),
-        b"runs": json.dumps(manifests, sort_keys=True).encode(),
-    }
-    _write(whole.replace_schema_metadata(metadata), target, replace)
-    return whole.num_rows
-
-
-def _require_finished(
-    source: Path, manifest: dict[str, Any], episodes: "pd.DataFrame", methods: Sequence[str]
-) -> None:
-    """Raises: BadOutput for a run whose `methods` (all, where none is named) lack episodes."""
-    of_run = manifest["configuration"]["methods"]
-    names = [name for name in of_run if name in methods] if methods else of_run
-    n_wanted = _count_wanted(_with_methods(manifest, names)["configuration"])
-    n_there = int(episodes["method"].isin(names).sum())
-    if n_there < n_wanted:
-        raise BadOutput(
-            f"publish: {source} holds {n_there} of {n_wanted} episodes of {', '.join(names)}; run "
-            "the same command again to finish it, or name what is finished with --methods."
-        )
-
-
-def _is_of(manifest: dict[str, Any], names: Sequence[str]) -> bool:
-    """Whether a run has one of these suites."""
-    return any(suite in names for suite, _ in manifest["configuration"]["tasks"])
-
-
-def _require_whole(runs: "list[Run]", names: Sequence[str]) -> None:
-    """Raises: BadOutput for no run of these suites, and for one of others, too."""
-    for manifest, _ in runs:
-        there = {suite for suite, _ in manifest["configuration"]["tasks"]}
-        if not there.issubset(names):
-            raise BadOutput(
-                f"publish: one run has {', '.join(sorted(there))}, and is taken whole; name all of "
-                "them with --suite, or none."
-            )
-    if not runs:
-        raise BadOutput(f"publish: the sources hold no run of {', '.join(names)}.")
-
-
-def _of_methods(runs: "list[Run]", names: Sequence[str]) -> "list[Run]":
-    """The runs with these methods alone. Raises: BadOutput for a method that none has."""
-    there = {method for manifest, _ in runs for method in manifest["configuration"]["methods"]}
-    missing = [name for name in names if name not in there]
+            of_run = manifest["configuration"]["methods"]
+            there |= dict.fromkeys(of_run)
+            taken = [name for name in of_run if name in methods] if methods else of_run
+            episodes = episodes[episodes["method"].isin(taken)]
+            changed = {**manifest, "configuration": {**manifest["configuration"], "methods": taken}}
+            if methods:
+                out = [name for name in of_run if name not in taken]
+                changed["left_out"] = [*manifest.get("left_out", []), *out]
+            if taken:
+                _require_finished(source, changed["configuration"], len(episodes))
+                runs.append((source, changed, episodes))
+    missing = [name for name in methods if name not in there]
     if missing:
         raise BadOutput(
             f"publish: the sources lack {', '.join(missing)}; they have {', '.join(sorted(there))}."
         )
-    kept = []
-    for manifest, episodes in runs:
-        of_run = manifest["configuration"]["methods"]
-        left = [name for name in of_run if name in names]
-        if left:
-            changed = _with_methods(manifest, left)
-            out = [name for name in of_run if name not in names]
-            changed["left_out"] = [*manifest.get("left_out", []), *out]
-            kept.append((changed, episodes[episodes["method"].isin(left)]))
-    return kept
-
-
-def _with_methods(manifest: dict[str, Any], methods: list[str]) -> dict[str, Any]:
-    return {**manifest, "configuration": {**manifest["configuration"], "methods": methods}}
-
-
-def _without_superseded(runs: "list[Run]") -> "list[Run]":
-    """The runs without the methods that later ones have for all the same episodes."""
-    kept = []
-    for i, run in enumerate(runs):
-        manifest, episodes = _supersede(run, runs[i + 1 :])
-        if len(episodes):
-            kept.append((manifest, episodes))
-    return kept
-
-
-def _supersede(run: "Run", later: "list[Run]") -> "Run":
-    """A run without the methods that later ones, one or several together, have read again.
-
-    Raises: BadOutput where they have only a part of a method's episodes.
-    """
-    manifest, episodes = run
-    names = [*KEY, "policy"]
-    gone = np.zeros(len(episodes), bool)
-    notes = []
-    for newer, again in later:
-        merged = episodes[names].merge(again[names], how="left", indicator=True)
-        repeated = (merged["_merge"] == "both").to_numpy()
-        if repeated.any():
-            of_newer = sorted(set(episodes["method"][repeated]))
-            notes.append({"methods": of_newer, "by": newer["digest"]})
-        gone |= repeated
-    methods = sorted(set(episodes["method"][gone]))
-    if not methods:
-        return run
-    if gone.sum() < episodes["method"].isin(methods).sum():
+    named = ((source, manifest) for source, manifest, _ in runs)
+    require_same_scenes(named, "publish", "publish them in tables of their own")
+    tables = []
+    for _, manifest, episodes in runs:
+        hidden = episodes.columns.str.fullmatch("detail|peak_mb|seconds_.*")
+        kept = episodes.loc[:, ~hidden].assign(configuration=manifest["digest"])
+        tables.append(pa.Table.from_pandas(kept, preserve_index=False))
+    whole = pa.concat_tables(tables, promote_options="permissive")
+    if whole.select([*KEY, "policy"]).to_pandas().duplicated().any():
         raise BadOutput(
-            f"publish: the later runs have only a part of the episodes of {', '.join(methods)}; "
-            "supersede a method by runs of the whole list."
+            f"publish: two of {', '.join(map(str, sources))} hold the same episodes; name each run "
+            "once."
         )
-    left = [name for name in manifest["configuration"]["methods"] if name not in methods]
-    changed = _with_methods(manifest, left)
-    changed["superseded"] = [*manifest.get("superseded", []), *notes]
-    return changed, episodes[~gone]
-
-
-def _count_wanted(study: dict[str, Any]) -> int:
-    """How many episodes a finished run of a configuration has."""
-    rows = 0
-    for suite, task in study["tasks"]:
-        rows += len(
-            suites.listed(
-                suite,
-                task,
-                n=study["episodes"],
-                seed=study["seed"],
-                seeds=study.get("seeds", 1),
-                split=study.get("split", ""),
-            )
-        )
-    return len(study["methods"]) * rows
-
-
-def _published_columns(episodes: "pd.DataFrame") -> list[str]:
-    columns = []
-    for name in episodes.columns:
-        if name not in ("detail", "peak_mb") and not name.startswith("seconds_"):
-            columns.append(name)
-    return columns
-
-
-def _exists(target: Path) -> BadOutput:
-    return BadOutput(f"publish: {target} exists; choose another name with --to, or pass --replace.")
-
-
-def _write(table: "pa.Table", target: Path, replace: bool) -> None:
+    notes = json.dumps([manifest for _, manifest, _ in runs], sort_keys=True).encode()
+    whole = whole.replace_schema_metadata({**(whole.schema.metadata or {}), b"runs": notes})
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(target, encode_table(table), replace=replace)
+        write_atomic(target, encode_table(whole), replace=replace)
     except OSError as error:
         if target.exists() and not replace:
-            raise _exists(target) from error
+            raise exists from error
         raise BadOutput(
             f"publish: {target} cannot be written ({error.strerror}); choose another place with "
             "--to."
         ) from error
+    return int(whole.num_rows)
+
+
+def _require_finished(source: Path, study: Mapping[str, Any], n_there: int) -> None:
+    """Raises: BadOutput for a run that lacks episodes."""
+    more = dict(n=study["episodes"], seed=study["seed"], seeds=study.get("seeds", 1))
+    more["split"] = study.get("split", "")
+    rows = sum(len(suites.listed(suite, task, **more)) for suite, task in study["tasks"])
+    n_wanted = rows * len(study["methods"])
+    if n_there < n_wanted:
+        raise BadOutput(
+            f"publish: {source} holds {n_there} of {n_wanted} episodes of "
+            f"{', '.join(study['methods'])}; run the same command again to finish it, or name what "
+            "is finished with --methods."
+        )
 
 
 SEEN_WITH = ("stack", "follow")
@@ -496,17 +351,14 @@ def load_runs(sources: Sequence[Path]) -> Runs:
     """
     import pandas as pd
 
-    tables = []
-    wanted = []
-    unfinished = []
+    tables, wanted, unfinished = [], [], []
     manifests = {}
     for name, manifest, table in _named_runs(sources):
         manifests[name] = manifest
         study = manifest["configuration"]
-        _check_run(name, study, table)
+        _check_episodes(name, study, table)
         # A checkpoint goes by its label, not by its path.
-        labels = dict(table.groupby("suite")["policy"].first())
-        asked = _count_asked(study, labels)
+        asked = _count_asked(study, dict(table.groupby("suite")["policy"].first()))
         _check_rows(name, study, table)
         total = asked["asked"].sum()
         if len(table) < total:
@@ -514,22 +366,25 @@ def load_runs(sources: Sequence[Path]) -> Runs:
                 f"{name} is unfinished: {len(table)} of {total} episodes; run the same command "
                 "again to finish it."
             )
-        tables.append(table)
+        tables.append(table.dropna(axis="columns", how="all"))
         wanted.append(asked.assign(run=str(name)))
     require_same_scenes(manifests.items(), "report", "report them one by one")
-    whole = _joined(tables)
+    whole = pd.concat(tables, ignore_index=True)
+    for column in (*NEEDED_COLUMNS, "attempt", "detail"):
+        if column not in whole:
+            whole[column] = None
+    whole[["split", "variant"]] = whole[["split", "variant"]].fillna("")
     if whole.duplicated([*PAIR_KEY, "method"]).any():
         raise BadOutput(
             f"report: two of {', '.join(map(str, manifests))} hold the same episodes; name each "
             "run once, or report them one by one."
         )
     expected = _in_order(pd.concat(wanted, ignore_index=True))
-    return Runs(
-        table=_sorted_as(whole, expected),
-        wanted=expected,
-        manifests=manifests,
-        unfinished=tuple(unfinished),
-    )
+    key = list(SCORE_KEY)
+    lines = pd.MultiIndex.from_frame(expected[key]).drop_duplicates()
+    order = lines.get_indexer(pd.MultiIndex.from_frame(whole[key])).argsort(kind="stable")
+    whole = whole.assign(layout=layout_names(whole)).iloc[order].reset_index(drop=True)
+    return Runs(whole, expected, manifests, tuple(unfinished))
 
 
 def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any], pd.DataFrame]]":
@@ -549,7 +404,7 @@ def _named_runs(sources: Sequence[Path]) -> "Iterator[tuple[Path, dict[str, Any]
             yield Path(name), manifest, table
 
 
-def _check_run(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:
+def _check_episodes(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> None:
     """Refuse what is no run, what is empty or too old, and a run of other episode lists."""
     require_episodes(name, study, "report")
     for suite in suites.changed_lists(study.get("lists", {})):
@@ -574,10 +429,11 @@ def _check_rows(name: Path, study: dict[str, Any], table: "pd.DataFrame") -> Non
     """Refuse rows that the configuration does not explain."""
     import pandas as pd
 
-    known = []
-    for suite, task, seed, rows in _asked_rows(study):
-        for episode, _ in rows:
-            known.append((suite, task, seed, episode))
+    known = [
+        (suite, task, seed, episode)
+        for suite, task, seed, rows in _asked_rows(study)
+        for episode, _ in rows
+    ]
     strange = ~pd.MultiIndex.from_frame(table[ROW_KEY]).isin(pd.MultiIndex.from_tuples(known))
     strange |= ~table["method"].isin(study["methods"]).to_numpy()
     if strange.any():
@@ -598,21 +454,14 @@ def _count_asked(study: dict[str, Any], labels: Mapping[str, str]) -> "pd.DataFr
 
     lines = []
     for suite, task, seed, rows in _asked_rows(study):
-        asked = whole = _count_by_split(rows)
+        asked = whole = Counter(split for _, split in rows)
         if suites.has_list(suite):
-            whole = _count_by_split(_episodes(suite, task, None, 0))
+            whole = Counter(split for _, split in _episodes(suite, task, None, 0))
         policy = labels.get(suite, study["policy"])
         for method in study["methods"]:
             for split, n in asked.items():
                 lines.append((suite, task, split, method, policy, seed, n, whole[split]))
     return pd.DataFrame(lines, columns=[*SCORE_KEY, "seed", "asked", "listed"])
-
-
-def _count_by_split(rows: Sequence[tuple[int, str]]) -> Counter[str]:
-    counts: Counter[str] = Counter()
-    for _, split in rows:
-        counts[split] += 1
-    return counts
 
 
 def _asked_rows(
@@ -632,23 +481,8 @@ def _episodes(
     suite: str, task: str, n: int | None, seed: int, split: str = ""
 ) -> tuple[tuple[int, str], ...]:
     """The episode and split of the rows of a task."""
-    episodes = []
-    for row in suites.rows(suite, task, n=n, seed=seed, split=split):
-        episodes.append((row.episode, row.split))
-    return tuple(episodes)
-
-
-def _joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
-    """The episodes of all runs; columns that a run lacks are None."""
-    import pandas as pd
-
-    kept = [table.dropna(axis="columns", how="all") for table in tables]
-    whole = pd.concat(kept, ignore_index=True)
-    for column in (*NEEDED_COLUMNS, "attempt", "detail"):
-        if column not in whole:
-            whole[column] = None
-    whole[["split", "variant"]] = whole[["split", "variant"]].fillna("")
-    return whole
+    rows = suites.rows(suite, task, n=n, seed=seed, split=split)
+    return tuple((row.episode, row.split) for row in rows)
 
 
 def _in_order(wanted: "pd.DataFrame") -> "pd.DataFrame":
@@ -661,17 +495,6 @@ def _in_order(wanted: "pd.DataFrame") -> "pd.DataFrame":
     return wanted.sort_values(ranks, kind="stable", ignore_index=True).drop(columns=ranks)
 
 
-def _sorted_as(episodes: "pd.DataFrame", wanted: "pd.DataFrame") -> "pd.DataFrame":
-    """The episodes in the order of the lines of `wanted`, with their layouts."""
-    import pandas as pd
-
-    key = list(SCORE_KEY)
-    lines = pd.MultiIndex.from_frame(wanted[key]).drop_duplicates()
-    order = lines.get_indexer(pd.MultiIndex.from_frame(episodes[key])).argsort(kind="stable")
-    episodes = episodes.assign(layout=layout_names(episodes))
-    return episodes.iloc[order].reset_index(drop=True)
-
-
 OUTCOMES = ("success", "failure", "error")
 
 
@@ -680,10 +503,10 @@ def results(runs: Runs) -> "pd.DataFrame":
 
     After the tasks of each track that has several, rows of ALL_TASKS follow; their `listed` counts
     the tasks that any method of the track was asked for. `n` of `listed` episodes were run, `asked`
-    were asked for. `sr_k` of `sr_n` episodes succeed; `sr_low` and
-    `sr_high` are Wilson's. `sr_layout_*` is the cluster bootstrap
-    over starting layouts where a layout was run more than once, else nan. `bound` marks a method or
-    policy that reads the simulator. `paper_*` are the paper's numbers.
+    were asked for. `sr_k` of `sr_n` episodes succeed; `sr_low` and `sr_high` are Wilson's.
+    `sr_layout_*` is the cluster bootstrap over starting layouts where a layout was run more than
+    once, else nan. `bound` marks a method or policy that reads the simulator. `paper_*` are the
+    paper's numbers.
 
     Raises: BadOutput, as `paper.ledger`.
     """
@@ -691,7 +514,8 @@ def results(runs: Runs) -> "pd.DataFrame":
 
     key = list(SCORE_KEY)
     table, wanted = _with_totals(runs)
-    counts = count(table, key).rename(columns=_count_columns()).drop(columns="steps")
+    rates = [f"{name}{part}" for name in RATES for part in ("", "_low", "_high")]
+    counts = score(table, key).drop(columns=["steps", *rates])
     lines = (
         wanted.groupby(key, sort=False)
         .agg(asked=("asked", "sum"), listed=("listed", "sum"), seeds=("seed", "nunique"))
@@ -703,8 +527,13 @@ def results(runs: Runs) -> "pd.DataFrame":
     counted = counts.columns.drop(key)
     lines[counted] = lines[counted].fillna(0).astype(int)
     for name in RATES:
-        _add_rate(lines, name)
-    lines = lines.merge(_layout_intervals(table), on=key, how="left")
+        add_rate(lines, name)
+    layouts = []
+    for names, part in layout_clusters(table, by=key).reset_index().groupby(key, sort=False):
+        ends = layout_interval(part["won"].to_numpy(), part["n"].to_numpy())
+        layouts.append((*names, len(part), *ends))
+    columns = [*key, "layouts", "sr_layout_low", "sr_layout_high"]
+    lines = lines.merge(pd.DataFrame(layouts, columns=columns), on=key, how="left")
     reading = pd.MultiIndex.from_frame(reads_simulator(table)[key])
     lines["bound"] = pd.MultiIndex.from_frame(lines[key]).isin(reading)
     lines["layouts"] = lines["layouts"].fillna(0).astype(int)
@@ -720,14 +549,10 @@ def paper_results(runs: Runs) -> "pd.DataFrame":
     import pandas as pd
 
     published = paper.main_results()
-    own = []
-    for manifest in runs.manifests.values():
-        if manifest["configuration"].get("object"):
-            own += [tuple(task) for task in manifest["configuration"]["tasks"]]
-    if not own:
-        return published
+    studies = [manifest["configuration"] for manifest in runs.manifests.values()]
+    own = [tuple(task) for study in studies if study.get("object") for task in study["tasks"]]
     tasks = pd.MultiIndex.from_frame(published[["suite", "task"]])
-    return published[~tasks.isin(own)]
+    return published[~tasks.isin(own)] if own else published
 
 
 def outcomes(runs: Runs) -> "pd.DataFrame":
@@ -759,38 +584,11 @@ def errors(runs: Runs, limit: int = 5) -> list[str]:
     details = runs.table.loc[runs.table["outcome"].eq("error"), "detail"].fillna("").astype(str)
     last_lines = details.str.strip().str.rsplit("\n", n=1).str[-1].str.slice(0, 160)
     counts = last_lines.replace("", "(no traceback was kept)").value_counts(sort=True)
-    lines = []
-    for text, n in counts.head(limit).items():
-        lines.append(f"{n} x {text}")
+    lines = [f"{n} x {text}" for text, n in counts.head(limit).items()]
     if len(counts) > limit:
         rest = counts.iloc[limit:].sum()
         lines.append(f"and {rest} of {len(counts) - limit} other kinds")
     return lines
-
-
-def comparisons(compared: Sequence[Comparison]) -> "pd.DataFrame":
-    """One row per comparison."""
-    import pandas as pd
-
-    columns = list(Comparison.__dataclass_fields__)
-    return pd.DataFrame([asdict(comparison) for comparison in compared], columns=columns)
-
-
-def _count_columns() -> dict[str, str]:
-    """The columns of `metrics.count` as this table names them."""
-    names = {}
-    for name, measure in zip(RATES, MEASURES, strict=True):
-        names[measure] = f"{name}_k"
-        names[f"{measure}_n"] = f"{name}_n"
-    return names
-
-
-def _add_rate(lines: "pd.DataFrame", name: str) -> None:
-    """Add a rate with Wilson's interval."""
-    k = lines[f"{name}_k"].to_numpy()
-    n = lines[f"{name}_n"].to_numpy()
-    lines[name] = np.divide(k, n, out=np.full(len(k), np.nan), where=n > 0)
-    lines[f"{name}_low"], lines[f"{name}_high"] = intervals(k, n)
 
 
 def _with_totals(runs: Runs) -> "tuple[pd.DataFrame, pd.DataFrame]":
@@ -821,19 +619,6 @@ def _listed_together(runs: Runs, lines: "pd.DataFrame", where: Sequence[str]) ->
     return whole.where(found["suite"].map(suites.has_list), found["listed"])
 
 
-def _layout_intervals(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The number of layouts of each line, and the cluster bootstrap of SR where layouts return."""
-    import pandas as pd
-
-    key = list(SCORE_KEY)
-    clusters = layout_clusters(table, by=key).reset_index()
-    lines = []
-    for names, part in clusters.groupby(key, sort=False):
-        low, high = layout_interval(part["won"].to_numpy(), part["n"].to_numpy())
-        lines.append((*names, len(part), low, high))
-    return pd.DataFrame(lines, columns=[*key, "layouts", "sr_layout_low", "sr_layout_high"])
-
-
 def reads_simulator(table: "pd.DataFrame") -> "pd.DataFrame":
     """The episodes whose method or policy reads the simulator; older runs say it of no method."""
     bound = np.zeros(len(table), bool)
@@ -844,7 +629,7 @@ def reads_simulator(table: "pd.DataFrame") -> "pd.DataFrame":
     return table[bound]
 
 
-EVAL_ONLY = ("seeds", "temperature", "images_every", "follow", "split", "audit")
+EVAL_ONLY = ("seeds", "temperature", "follow", "split", "audit")
 """Fields of a study that `eval` has options for, and `rollout` has none."""
 
 
@@ -859,22 +644,19 @@ def provenance(runs: Runs) -> "pd.DataFrame":
     lines = []
     for name, manifest in runs.manifests.items():
         study: dict[str, Any] = manifest["configuration"]
+        first, count = study["seed"], study.get("seeds", 1)
+        about: dict[str, Any] = {
+            "run": str(name),
+            "digest": manifest["digest"],
+            "version": study.get("version", ""),
+            "policy": study["policy"],
+            "seed": str(first) if count == 1 else f"{first}..{first + count - 1}",
+        }
+        about |= {part: study.get(part, "") for part in ("stack", "robots", "world")}
+        about |= {part: _shortened(study.get(part, {})) for part in ("weights", "lists")}
         today = {**study, "policy": _policy(runs, name)}
-        lines.append(
-            {
-                "run": str(name),
-                "digest": manifest["digest"],
-                "version": study.get("version", ""),
-                "policy": study["policy"],
-                "seed": _seeds(study),
-                "stack": study.get("stack", ""),
-                "robots": study.get("robots", ""),
-                "world": study.get("world", ""),
-                "weights": _shortened(study.get("weights", {})),
-                "lists": _shortened(study.get("lists", {})),
-                "command": str(manifest.get("command") or command_line(today)),
-            }
-        )
+        about["command"] = str(manifest.get("command") or command_line(today))
+        lines.append(about)
     return pd.DataFrame(lines)
 
 
@@ -893,59 +675,45 @@ def command_line(study: dict[str, Any]) -> str:
     It finds the user's own suites, where they are known here.
     """
     files = suites.own_files(suite for suite, _ in study["tasks"])
-    study = {**study, "suite_files": files}
-    tasks_by_suite: dict[str, list[str]] = {}
-    for suite, task in study["tasks"]:
-        tasks_by_suite.setdefault(suite, []).append(task)
-    changed = _changed(study)
-    whole = _are_whole_suites(changed["tasks"], study.get("object", ""))
-    if _is_demo(study, changed):
-        return command("demo", "--episodes", str(study["episodes"]), "--seed", str(study["seed"]))
-    if not whole and not _suits_rollout(study, changed):
-        return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
-    words = ["eval" if whole else "rollout"]
-    for suite, tasks in tasks_by_suite.items():
-        words += ["--suite", suite]
-        if not whole:
-            for task in tasks:
-                words += ["--task", task]
-    for method in study["methods"]:
-        words += ["--method", method]
-    for name, setting in _options(study, whole).items():
-        if setting is not None:
-            words += [f"--{name}", str(setting)]
-    if study.get("audit"):
-        words.append("--audit")
-    return command(*words, environment=suites.own.environment(files))
-
-
-def _is_demo(study: dict[str, Any], changed: dict[str, Any]) -> bool:
-    """Whether `demo` makes it, which has options for the number of episodes and the seed alone."""
-    if (changed["tasks"], changed["methods"]) != (DEMO.tasks, DEMO.methods):
-        return False
-    rest = changed.keys() - {"tasks", "methods", "seed"}
-    return study.get("episodes") is not None and rest == {"episodes"}
-
-
-def _changed(study: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a configuration that differ from a study's defaults."""
     changed: dict[str, Any] = {
         "tasks": tuple(tuple(task) for task in study["tasks"]),
         "methods": tuple(study["methods"]),
     }
     for field in fields(Study)[len(changed) :]:
-        setting = study.get(field.name, field.default)
+        setting = files if field.name == EXECUTED else study.get(field.name, field.default)
         if setting != field.default:
             changed[field.name] = setting
-    return changed
-
-
-def _suits_rollout(study: dict[str, Any], changed: dict[str, Any]) -> bool:
-    """Whether `rollout` runs some tasks: of one suite, and of a list never the whole."""
-    names = {suite for suite, _ in study["tasks"]}
-    if len(names) > 1 or not changed.keys().isdisjoint(EVAL_ONLY):
-        return False
-    return study.get("episodes") is not None or not suites.has_list(names.pop())
+    is_demo = (changed["tasks"], changed["methods"]) == (DEMO.tasks, DEMO.methods)
+    if is_demo and changed.keys() - {"tasks", "methods", "seed"} == {"episodes"}:
+        given = ("--episodes", str(study["episodes"]), "--seed", str(study["seed"]))
+        return command("demo", *given)
+    whole = "images_every" not in changed
+    whole &= _are_whole_suites(changed["tasks"], study.get("object", ""))
+    names = list(dict.fromkeys(suite for suite, _ in changed["tasks"]))
+    suits_rollout = len(names) == 1 and changed.keys().isdisjoint({*EVAL_ONLY, "images_every"})
+    if suits_rollout and suites.has_list(names[0]):
+        suits_rollout = study.get("episodes") is not None
+    if not whole and not suits_rollout:
+        return f"Study({', '.join(f'{name}={setting!r}' for name, setting in changed.items())})"
+    words = ["eval" if whole else "rollout"]
+    for name in names:
+        words += ["--suite", name]
+    if not whole:
+        for _, task in changed["tasks"]:
+            words += ["--task", task]
+    for method in study["methods"]:
+        words += ["--method", method]
+    options = ["episodes", "seed", "policy", "stack", "robots", "object", "split", "temperature"]
+    given = {name: study.get(name) for name in options}
+    if whole:
+        given["seeds"] = study["seeds"] if study.get("seeds", 1) > 1 else None
+        given["follow"] = study.get("follow")
+    for name, setting in given.items():
+        if setting is not None:
+            words += [f"--{name}", str(setting)]
+    if study.get("audit"):
+        words.append("--audit")
+    return command(*words, environment=suites.own.environment(files))
 
 
 def _are_whole_suites(tasks: tuple[tuple[str, str], ...], own: str) -> bool:
@@ -958,39 +726,12 @@ def _are_whole_suites(tasks: tuple[tuple[str, str], ...], own: str) -> bool:
         return False  # the object was imported elsewhere
 
 
-def _options(study: dict[str, Any], whole: bool) -> dict[str, Any]:
-    """The options of a command and their settings, None where the default holds."""
-    options = {}
-    for name in ("episodes", "seed", "policy", "stack", "robots", "object", "split", "temperature"):
-        options[name] = study.get(name)
-    if whole:
-        options["seeds"] = None
-        if study.get("seeds", 1) > 1:
-            options["seeds"] = study["seeds"]
-        options["follow"] = study.get("follow")
-        options["images-every"] = study.get("images_every") or None
-    return options
-
-
-def _seeds(study: dict[str, Any]) -> str:
-    first = study["seed"]
-    count = study.get("seeds", 1)
-    if count == 1:
-        return str(first)
-    return f"{first}..{first + count - 1}"
-
-
 def _shortened(checksums: Any) -> str:
     if not isinstance(checksums, dict):
         return str(checksums)
-    parts = []
-    for name, digest in checksums.items():
-        parts.append(f"{name}:{str(digest)[:12]}")
-    return " ".join(parts)
+    return " ".join(f"{name}:{str(digest)[:12]}" for name, digest in checksums.items())
 
 
 def track_title(suite: str, split: str) -> str:
     """A suite, and its split where it has several."""
-    if not split:
-        return suite
-    return f"{suite}, {split}"
+    return f"{suite}, {split}" if split else suite

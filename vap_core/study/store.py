@@ -249,13 +249,12 @@ def _read_part(path: Path) -> "pa.Table":
     )
 
 
-def write_json_part(
-    path: Path, content: Any, caller: str, default: Callable[[Any], Any] | None = None
-) -> None:
-    """Keep one finished part; its folder is made. `default` is json's. Raises: BadOutput."""
+def write_json_part(path: Path, content: Any, caller: str) -> None:
+    """Keep one finished part; its folder is made. Raises: BadOutput."""
     with writing(path.parent, caller):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, json.dumps(content, default=default).encode())
+        # Scalars of NumPy become numbers.
+        write_atomic(path, json.dumps(content, default=lambda scalar: scalar.item()).encode())
 
 
 def read_json_part(path: Path, caller: str) -> Any:
@@ -268,13 +267,39 @@ def read_json_part(path: Path, caller: str) -> Any:
         ) from error
 
 
-def write_table(table: "pd.DataFrame", out: Path, name: str) -> list[Path]:
-    """The table as Parquet, for programs, and as CSV, for people. Raises: BadOutput."""
-    paths = [out / f"{name}.parquet", out / f"{name}.csv"]
-    with writing(out, name):
-        write_atomic(paths[0], table.to_parquet(index=False, compression="zstd"))
-        write_atomic(paths[1], table.round(4).to_csv(index=False).encode())
-    return paths
+def write_tables(
+    folder: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]], caller: str
+) -> "dict[str, pd.DataFrame]":
+    """Each table as NAME.parquet, for programs, with the run's manifest in its metadata, and as
+    NAME.csv, for people; returns the tables as they are read back. Raises: BadOutput.
+    """
+    import pyarrow as pa
+
+    about = json.dumps(read_manifest(folder), sort_keys=True).encode()
+    for name, rows in tables.items():
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        arrow = pa.table({"suite": pa.array([], pa.string())})
+        if rows:
+            arrow = pa.table({name: [row.get(name) for row in rows] for name in columns})
+        with writing(folder, caller):
+            data = encode_table(arrow.replace_schema_metadata({b"run": about}))
+            write_atomic(folder / f"{name}.parquet", data)
+            csv = arrow.to_pandas().round(4).to_csv(index=False)
+            write_atomic(folder / f"{name}.csv", csv.encode())
+    return read_tables({name: folder / f"{name}.parquet" for name in tables}, caller)
+
+
+def read_tables(paths: Mapping[str, Path], caller: str) -> "dict[str, pd.DataFrame]":
+    """Tables by name. Raises: BadOutput, where one is missing or damaged."""
+    missing = [path.name for path in paths.values() if not path.exists()]
+    if missing:
+        folder = next(iter(paths.values())).parent
+        raise BadOutput(
+            f"{caller}: {folder} lacks {', '.join(missing)}; run the same {caller} again to finish "
+            "it, or with --publish to keep its tables there."
+        )
+    remedy = "delete it and run the same command again"
+    return {name: read_arrow(path, caller, remedy).to_pandas() for name, path in paths.items()}
 
 
 def encode_table(table: "pa.Table") -> bytes:

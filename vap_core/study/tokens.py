@@ -8,18 +8,16 @@ p values take objects, not episodes, as the independent units.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import align as text_table
-from vap_core.base.files import read_parquet, write_atomic, writing
+from vap_core.base.errors import BadStudy, one_of
 from vap_core.base.types import Mask, Rgb, value
 from vap_core.perception.boxes import mask_box
 from vap_core.policies.lerobot.checkpoints import fingerprint
@@ -35,11 +33,12 @@ from vap_core.policies.mini_pi0.learned_token import (
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.studio import reference_views
-from vap_core.study import store
+from vap_core.study import measurement, store
 from vap_core.study.engine import spread_evenly
+from vap_core.study.measurement import Measurement, Row, Tables
 from vap_core.study.perception import opening_views
-from vap_core.study.processes import results
-from vap_core.study.stats import Estimate, Rate, bootstrap_interval, holm, rate, share_by, sign_flip
+from vap_core.study.stats import Estimate, holm, rate, resampled_mean, share_by, sign_flip, student
+from vap_core.study.table import printed
 from vap_core.study.trials import Study, shipped
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
 
     from vap_core.policies.mini_pi0.vlm import MiniVlm
 
-CALLER = "measure tokens"
 KS = (1, 3, 5, 7)
 """Numbers of photos to learn from."""
 USUAL_K = learned_token.K
@@ -59,15 +57,28 @@ TABLES = ("answers", "embeddings", "choices")
 episodes."""
 TRAINING = ["suite", "task", "k", "learned_in", "epochs"]
 """The columns that name one training."""
-NOT_KEY = ("yes", "n", "embedding", "views", "score")
 Place = Literal["vlm", "policy"]
 PLACES: tuple[Place, ...] = ("vlm", "policy")
 """Where a token is learned: in the model, or in the policy's own weights."""
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Tokens:
+class Job:
+    """One training: `where` the token is learned, from `k` photos."""
+
+    suite: str
+    task: str
+    k: int
+    where: Place
+    epochs: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.suite}.{self.task}.{self.where}.{self.k}"
+
+
+@dataclass(frozen=True)
+class Tokens(Measurement):
     """What is asked for: the suites, numbers of photos, epochs of a training, and where.
 
     Raises: UnknownName for a place that is none of PLACES, or a suite that is no benchmark;
@@ -78,6 +89,7 @@ class Tokens:
     ks: tuple[int, ...] = KS
     epochs: int = TokenTraining().epochs
     places: tuple[str, ...] = PLACES
+    caller: ClassVar[str] = "measure tokens"
 
     def __post_init__(self) -> None:
         for place in self.places:
@@ -92,7 +104,7 @@ class Tokens:
                     f"policy --suite {name}"
                 )
 
-    def configuration(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """What the results depend on, as JSON; suites and numbers of photos may be added to.
 
         Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadSuite,
@@ -111,149 +123,67 @@ class Tokens:
             **{name: shown[name] for name in ("version", "lists", "world")},
         }
 
+    def jobs(self) -> list[Job]:
+        """Every job: the usual number of photos of every object first.
 
-@dataclass(frozen=True)
-class Job:
-    """One training: `where` the token is learned, from `k` photos."""
-
-    suite: str
-    task: str
-    k: int
-    where: Place
-    epochs: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.suite}.{self.task}.{self.where}.{self.k}"
-
-
-def plan(asked: Tokens) -> list[Job]:
-    """Every job: the usual number of photos of every object first."""
-    jobs = []
-    usual = [k for k in asked.ks if k == USUAL_K]
-    for ks in (usual, [k for k in asked.ks if k != USUAL_K]):
-        for suite in asked.suites:
-            for task in suites.suite(suite).tasks:
-                for k in ks:
-                    for place in PLACES:
-                        if place in asked.places and (place == "vlm" or k == USUAL_K):
-                            jobs.append(Job(suite, task.name, k, place, asked.epochs))
-    return jobs
-
-
-def run_job(job: Job) -> dict[str, list[Row]]:
-    """Learn one token, and return the rows of every table.
-
-    Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadMemory when a kind
-        of photo is missing; BadSuite for a damaged list.
-    """
-    from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
-
-    target = suites.rows(job.suite, job.task, 1)[0].target
-    taught = _photos(job.suite, job.task, 0, job.k)
-    shown = _shown(job.suite, job.task)
-    policy_folder, model_folder = shipped(job.suite), _model_folder(job.suite)
-    teacher = _model(model_folder) if job.where == "vlm" else _policy_model(job.suite)
-    training = TokenTraining(epochs=job.epochs)
-    about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
-    about |= {"learned_in": job.where, "epochs": job.epochs}
-    answers: list[Row] = []
-    chosen: list[Row] = []
-    with fused_attention():
-        measured = _measured_epochs(job.epochs)
-        for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
-            if epoch in measured:
-                where = {**about, "step": step, "token": "as learned", "read_by": job.where}
-                answers += _answers(where, teacher, embedding, shown)
-        where = {**about, "token": "as learned", "read_by": job.where}
-        views = scenes(job.suite, job.task)
-        for name, part in (
-            (SCENE, views),
-            (PHOTO, in_photos(views, shown)),
-        ):
-            chosen += scores({**where, "seen_in": name}, teacher, embedding, part)
-        if job.where == "vlm":
-            reader = _policy_model(job.suite)
-            aligned = align(embedding, model_folder, policy_folder)
-            for token, read in (("copied", embedding), ("aligned", aligned)):
-                where = {**about, "step": step, "token": token, "read_by": "policy"}
-                answers += _answers(where, reader, read, shown)
-    learned = {**about, "step": step, "embedding": embedding.tolist()}
-    return {"answers": answers, "embeddings": [learned], "choices": chosen}
-
-
-def run(
-    asked: Tokens, folder: Path, *, workers: int = 1, progress: bool = True
-) -> "dict[str, pd.DataFrame]":
-    """Do what `folder` lacks, and return the tables.
-
-    Raises: BadOutput when the folder holds another run, is in use or cannot be written; BadStudy
-        when nothing is asked for; WorkerDied.
-    """
-    from tqdm import tqdm
-
-    jobs = plan(asked)
-    if not jobs:
-        raise BadStudy(
-            f"measure tokens: in the policy a token is learned from {USUAL_K} photos alone; ask "
-            f"for --k {USUAL_K}, or for --learn-in vlm."
-        )
-    store.open_run(folder, asked.configuration())
-    with store.locked(folder):
-        done = folder / "done"
-        with writing(folder, CALLER):
-            done.mkdir(exist_ok=True)
-        missing = [job for job in jobs if not _is_done(folder, job)]
-        with tqdm(
-            total=len(jobs),
-            initial=len(jobs) - len(missing),
-            unit="token",
-            disable=not progress,
-        ) as bar:
-            for job, tables in results(run_job, missing, workers=workers, remedy="--workers"):
-                parts = []
-                for name, rows in tables.items():
-                    part = store.write_part(folder, name, rows, caller=CALLER)
-                    parts.append(f"{part.relative_to(folder)}\n")
-                with writing(folder, CALLER):
-                    write_atomic(done / job.name, "".join(parts).encode())
-                bar.update()
-    return read(folder)
-
-
-def _is_done(folder: Path, job: Job) -> bool:
-    """Whether a training has ended and every part that it wrote is still there.
-
-    It wrote some: a file that names none was not written to its end.
-    """
-    try:
-        parts = (folder / "done" / job.name).read_text().splitlines()
-    except OSError:
-        return False
-    return bool(parts) and all((folder / part).exists() for part in parts)
-
-
-def read(folder: Path) -> "dict[str, pd.DataFrame]":
-    """The tables of a run, as far as it is. Raises: BadOutput."""
-    import pandas as pd
-
-    tables = {}
-    for name in TABLES:
-        parts = []
-        for path in sorted((folder / name).glob("*.parquet")):
-            remedy = "delete it and run the same command again"
-            parts.append(read_parquet(path, "measure tokens", remedy))
-        if not parts:
-            raise BadOutput(
-                f"measure tokens: {folder} holds no {name}; run the same command again to finish "
-                "it."
+        Raises: BadStudy when nothing is asked for.
+        """
+        usual = [k for k in self.ks if k == USUAL_K]
+        jobs = [
+            Job(suite, task.name, k, place, self.epochs)
+            for ks in (usual, [k for k in self.ks if k != USUAL_K])
+            for suite in self.suites
+            for task in suites.suite(suite).tasks
+            for k in ks
+            for place in PLACES
+            if place in self.places and (place == "vlm" or k == USUAL_K)
+        ]
+        if not jobs:
+            raise BadStudy(
+                f"measure tokens: in the policy a token is learned from {USUAL_K} photos alone; "
+                f"ask for --k {USUAL_K}."
             )
-        whole = pd.concat(parts, ignore_index=True)
-        key = [column for column in whole.columns if column not in NOT_KEY]
-        # A run that was killed between two files has written one of them twice.
-        whole = whole.drop_duplicates(key, ignore_index=True)
-        tables[name] = whole.sort_values(key, ignore_index=True)
-    return tables
+        return jobs
+
+    def run(self, job: Job, folder: Path) -> Tables:
+        """Learn one token, and return the rows of every table.
+
+        Raises: BadPolicy for a shipped policy or model that is absent or damaged; BadMemory when a
+            kind of photo is missing; BadSuite for a damaged list.
+        """
+        from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
+
+        target = suites.rows(job.suite, job.task, 1)[0].target
+        taught = _photos(job.suite, job.task, 0, job.k)
+        shown = _shown(job.suite, job.task)
+        policy_folder, model_folder = shipped(job.suite), _model_folder(job.suite)
+        teacher = _model(model_folder) if job.where == "vlm" else _policy_model(job.suite)
+        training = TokenTraining(epochs=job.epochs)
+        about = {"suite": job.suite, "task": job.task, "object": target, "k": job.k}
+        about |= {"learned_in": job.where, "epochs": job.epochs}
+        answers: list[Row] = []
+        chosen: list[Row] = []
+        with fused_attention():
+            measured = _measured_epochs(job.epochs)
+            for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
+                if epoch in measured:
+                    where = {**about, "step": step, "token": "as learned", "read_by": job.where}
+                    answers += _answers(where, teacher, embedding, shown)
+            where = {**about, "token": "as learned", "read_by": job.where}
+            views = scenes(job.suite, job.task)
+            for name, part in (
+                (SCENE, views),
+                (PHOTO, in_photos(views, shown)),
+            ):
+                chosen += scores({**where, "seen_in": name}, teacher, embedding, part)
+            if job.where == "vlm":
+                reader = _policy_model(job.suite)
+                aligned = align(embedding, model_folder, policy_folder)
+                for token, read in (("copied", embedding), ("aligned", aligned)):
+                    where = {**about, "step": step, "token": token, "read_by": "policy"}
+                    answers += _answers(where, reader, read, shown)
+        learned = {**about, "step": step, "embedding": embedding.tolist()}
+        return {"answers": answers, "embeddings": [learned], "choices": chosen}
 
 
 def publish(folder: Path, to: Path) -> list[Path]:
@@ -263,10 +193,10 @@ def publish(folder: Path, to: Path) -> list[Path]:
     """
     manifest = store.read_manifest(folder)
     tables = {}
-    for name, table in read(folder).items():
+    for name, table in measurement.read(folder, Tokens.caller, TABLES).items():
         path = to / f"token_{name}.parquet"
         tables[path.name] = store.add_rows(path, table, TRAINING, {b"runs": manifest})
-    return store.publish_tables(tables, to, caller="measure tokens")
+    return store.publish_tables(tables, to, caller=Tokens.caller)
 
 
 def _measured_epochs(epochs: int) -> set[int]:
@@ -504,10 +434,11 @@ def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
     for step, gains in steps.items():
         of_step: list[dict[str, Any]] = []
         for suite, part in _parts(gains):
-            by_object = _by_object(part)
+            grouped = part.groupby(["suite", "object"], sort=True, observed=True)["gain"]
+            by_object = grouped.agg(["sum", "size"])
             line = {"step": step, "suite": suite, "objects": len(by_object)}
             p = sign_flip(by_object["sum"].to_numpy(float))
-            of_step.append({**line, "loss": _mean_gain(part), "p": p, "p_holm": p})
+            of_step.append({**line, "loss": resampled_mean(by_object), "p": p, "p_holm": p})
         single = [line for line in of_step if line["suite"] != ALL_SUITES]
         for line, p_holm in zip(single, holm([line["p"] for line in single]), strict=True):
             line["p_holm"] = p_holm
@@ -536,20 +467,6 @@ def _gains_of_scene(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.Data
     both = chosen(table[table["seen_in"] == SCENE]).merge(soft, on=KEY)
     touched = both["first_object_correct"].astype(float)
     return both.assign(gain=both["right"].astype(float) - touched)
-
-
-def _by_object(gains: "pd.DataFrame") -> "pd.DataFrame":
-    """The sum of an object's gains, and the number of its episodes."""
-    return gains.groupby(["suite", "object"], sort=True, observed=True)["gain"].agg(["sum", "size"])
-
-
-def _mean_gain(gains: "pd.DataFrame") -> Estimate:
-    """The mean gain of episodes; its interval resamples objects with all their episodes."""
-    by_object = _by_object(gains)
-    low, high = bootstrap_interval(
-        by_object["sum"].to_numpy(float), by_object["size"].to_numpy(float)
-    )
-    return Estimate(value=float(gains["gain"].mean()), low=low, high=high, n=len(gains))
 
 
 KINDS = ("own", "look-alikes", "other objects")
@@ -589,7 +506,7 @@ def reading(answers: "pd.DataFrame", name: str) -> "pd.DataFrame":
     ]
 
 
-def said_yes(rows: "pd.DataFrame") -> Rate:
+def said_yes(rows: "pd.DataFrame") -> Estimate:
     """The share of the rows' photos to which the answer was yes."""
     return rate(int(rows.yes.sum()), int(rows.n.sum()))
 
@@ -603,20 +520,20 @@ def right(rows: "pd.DataFrame") -> float:
 def curve(answers: "pd.DataFrame") -> "pd.DataFrame":
     """By number of photos and step: yes to each kind of photo, over all objects of the rows.
 
-    Columns: k, step, kind, objects, n, yes, low, high.
+    Columns: k, step, kind, objects, n, value, low, high.
     """
     import pandas as pd
 
     rows = reading(answers, "as learned")
     lines = []
     for (k, step, kind), part in rows.groupby(["k", "step", kind_of(rows)]):
-        found = said_yes(part)
-        lines.append((k, step, kind, part.object.nunique(), *_numbers(found)))
-    return pd.DataFrame(lines, columns=["k", "step", "kind", "objects", "n", "yes", "low", "high"])
+        about = dict(k=k, step=step, kind=kind, objects=part.object.nunique())
+        lines.append({**about, **_numbers(said_yes(part))})
+    return pd.DataFrame(lines)
 
 
 def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
-    """By object and reading: right, and yes to each kind of photo as `Rate`s."""
+    """By object and reading: right, and yes to each kind of photo, `Estimate`s."""
     import pandas as pd
 
     ends = final(answers)
@@ -625,9 +542,8 @@ def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     for name in READINGS:
         for (suite, obj), part in reading(ends, name).groupby(["suite", "object"], sort=False):
             kinds = kind_of(part)
-            rates = {kind: said_yes(part[kinds == kind]) for kind in KINDS}
-            lines.append({"suite": suite, "object": obj, "reading": name, "right": right(part)})
-            lines[-1] |= rates
+            line = {"suite": suite, "object": obj, "reading": name, "right": right(part)}
+            lines.append(line | {kind: said_yes(part[kinds == kind]) for kind in KINDS})
     return pd.DataFrame(lines, columns=["suite", "object", "reading", "right", *KINDS])
 
 
@@ -648,10 +564,7 @@ def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
         kinds = kind_of(part)
         of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
         line = {"reading": name, "right": mean_of_tokens(of_objects)}
-        for kind in KINDS:
-            found = said_yes(part[kinds == kind])
-            line[kind] = Estimate(value=found.value, low=found.low, high=found.high, n=found.n)
-        lines.append(line)
+        lines.append(line | {kind: said_yes(part[kinds == kind]) for kind in KINDS})
     return pd.DataFrame(lines, columns=["reading", "right", *KINDS]).set_index("reading")
 
 
@@ -663,9 +576,9 @@ def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     ends = ends[(ends.k == k) & (kind_of(ends) == "look-alikes")]
     lines = []
     for row in ends.itertuples():
-        lines.append((row.suite, row.object, row.shown, *_numbers(rate(row.yes, row.n))))
-    columns = ["suite", "object", "look-alike", "n", "yes", "low", "high"]
-    return pd.DataFrame(lines, columns=columns)
+        about = {"suite": row.suite, "object": row.object, "look-alike": row.shown}
+        lines.append({**about, **_numbers(rate(row.yes, row.n))})
+    return pd.DataFrame(lines)
 
 
 def success_by_token(episodes: "pd.DataFrame", other: str, one: str = "soft") -> "pd.Series":
@@ -684,64 +597,47 @@ def mean_of_tokens(values: Sequence[float], least: float = 0.0) -> Estimate:
 
     A single token has no interval. `least` is -1 for differences.
     """
-    import numpy as np
-    from scipy import stats
-
-    n = len(values)
-    middle = float(np.mean(values))
-    if n < 2:
-        return Estimate(value=middle, low=float("nan"), high=float("nan"), n=n)
-    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
-    return Estimate(value=middle, low=max(least, middle - half), high=min(1.0, middle + half), n=n)
+    found = student(values)
+    return replace(found, low=max(found.low, least), high=min(found.high, 1.0))
 
 
-def report(tables: Mapping[str, "pd.DataFrame"]) -> str:
+def report(tables: "Mapping[str, pd.DataFrame]") -> str:
     """What the command prints."""
+    import pandas as pd
+
     answers = tables["answers"]
-    found = readings(answers)
-    rows = [["object", "token", "right, %", *(f"yes to {kind}" for kind in KINDS)]]
-    for line in found.to_dict("records"):
-        cells = [str(line["object"]), str(line["reading"]), f"{100 * line['right']:.1f}"]
-        rows.append([*cells, *(text(line[kind]) for kind in KINDS)])
-    by_k = [["photos, steps", "objects", *(f"yes to {kind}" for kind in KINDS)]]
-    whole = curve(answers)
-    for (k, step), part in whole.groupby(["k", "step"]):
-        of_kind = part.set_index("kind")
-        cells = [f"{k}, {step}", str(int(part.objects.max()))]
-        for kind in KINDS:
-            line = of_kind.loc[kind]
-            cells.append(_text(line.yes, line.low, line.high, int(line.n)))
-        by_k.append(cells)
-    parts = [text_table(rows), text_table(by_k)]
-    if "choices" in tables:
-        parts.append(text_table(_choice_rows(tables["choices"])))
-    return "\n\n".join([*parts, NOTE])
+    found = readings(answers).drop(columns="suite")
+    names = {kind: f"yes to {kind}" for kind in KINDS}
+    texts = {kind: [each.text() for each in found[kind]] for kind in KINDS}
+    shown = found.assign(right=(100 * found["right"]).map("{:.1f}".format), **texts)
+    shown = shown.rename(columns={"reading": "token", "right": "right, %", **names})
+    lines = []
+    for (k, step), part in curve(answers).groupby(["k", "step"]):
+        line = {"photos, steps": f"{k}, {step}", "objects": int(part.objects.max())}
+        for kind, row in zip(part.kind, part.itertuples(), strict=True):
+            line[names[str(kind)]] = Estimate(row.value, row.low, row.high, row.n).text()
+        lines.append(line)
+    by_k = pd.DataFrame(lines)[["photos, steps", "objects", *names.values()]]
+    return "\n\n".join([*map(printed, (shown, by_k, _choices(tables["choices"]))), NOTE])
 
 
-def _choice_rows(table: "pd.DataFrame") -> list[list[str]]:
+def _choices(table: "pd.DataFrame") -> "pd.DataFrame":
     """By suite: whether the model chooses the target among the objects of listed episodes."""
-    from vap_core.study.stats import share_by
+    import pandas as pd
 
-    rows = [["objects of first views", "seen in", "chance", "the model chooses the target"]]
+    lines = []
     usual = reading(table, "as learned")
     usual = usual[usual.k == USUAL_K]
     several = usual["epochs"].nunique() > 1
     for (suite, epochs, seen_in), part in usual.groupby(["suite", "epochs", "seen_in"], sort=False):
         found = chosen(part)
-        name = f"{suite}, {epochs} epochs" if several else str(suite)
-        chance = f"{100 * found.chance.mean():.1f}"
-        rows.append([name, str(seen_in), chance, share_by(found, "right", OBJECTS).text()])
-    return rows
+        name = f"{suite}, {epochs} epochs" if several else suite
+        line = {"objects of first views": name, "seen in": seen_in}
+        line["chance"] = f"{100 * found.chance.mean():.1f}"
+        right = share_by(found, "right", OBJECTS).text()
+        lines.append({**line, "the model chooses the target": right})
+    return pd.DataFrame(lines)
 
 
-def text(found: Rate) -> str:
-    """A rate with its interval and n: "97.2 [94.0, 98.7] 180"."""
-    return _text(found.value, found.low, found.high, found.n)
-
-
-def _numbers(found: Rate) -> tuple[int, float, float, float]:
-    return found.n, found.value, found.low, found.high
-
-
-def _text(value: float, low: float, high: float, n: int) -> str:
-    return Estimate(value=float(value), low=float(low), high=float(high), n=n).text()
+def _numbers(found: Estimate) -> dict[str, float | int]:
+    return {"n": found.n, "value": found.value, "low": found.low, "high": found.high}

@@ -20,7 +20,7 @@ from vap_core.perception.boxes import crop
 from vap_core.perception.describe import CropAttributes, measure_crop, phrase_attributes
 from vap_core.simulation.assets.objects import ObjectModel, get_object
 from vap_core.simulation.studio import Stage, reference_shots
-from vap_core.study.processes import results_here
+from vap_core.study.workers import results_here
 from vap_make.films.scenes import only_generic
 from vap_make.folder import reading_kept
 

@@ -32,8 +32,8 @@ from vap_core.base.files import code_version, parse_json, read_file, write_atomi
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Suite, suite
 from vap_core.simulation.types import EE_ACTION
-from vap_core.study.processes import results
 from vap_core.study.store import locked, open_run
+from vap_core.study.workers import results
 from vap_make.films.demonstrations import MOST, PARTS, Film, cached, stage_file
 from vap_make.recipe import every, filmed_task
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from vap_core.base.files import kept_folder, make_folder, writing
 from vap_core.perception.embedded.networks import PERCEPTION, save_weights
 from vap_core.simulation.assets import objects
-from vap_core.study.processes import results
+from vap_core.study.workers import results
 from vap_make.films.scenes import VIEWS, Shots, cached, only_generic, stage_file
 from vap_make.perception import detector, instance_head, segmenter
 from vap_make.perception.fitting import Run

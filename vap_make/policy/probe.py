@@ -29,9 +29,9 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
-from vap_core.study.processes import results
 from vap_core.study.stats import rate
 from vap_core.study.trials import shipped
+from vap_core.study.workers import results
 from vap_make.films.captions import describe, distinguishes
 from vap_make.films.demonstrations import draw_objects, row
 from vap_make.policy.colouring import natural_colours, painted, tinted

@@ -21,7 +21,7 @@ from vap_core.policies.mini_pi0.learned_token import Photos, TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_core.simulation.assets import objects
 from vap_core.simulation.studio import photograph, reference_shots
-from vap_core.study.processes import results_here
+from vap_core.study.workers import results_here
 from vap_make.films.demonstrations import Film
 from vap_make.films.scenes import TRAIN_INSTANCES, only_generic
 from vap_make.folder import reading_kept

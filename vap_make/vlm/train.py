@@ -30,7 +30,7 @@ from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
 from vap_core.simulation.assets.objects import get_object
-from vap_core.study.processes import results
+from vap_core.study.workers import results
 from vap_make.films.captions import captions
 from vap_make.films.demonstrations import SIDE, small
 from vap_make.films.looks import draw_look

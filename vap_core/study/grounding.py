@@ -1,22 +1,41 @@
-"""Ground one picture, and give the answer as text, JSON, a picture and a recording.
+"""Ground one picture, or a clip, and give the answer as text, JSON, pictures and a recording.
 
 The answer is the candidates, the votes, the margin and the rewritten instruction.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+import os.path
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.attend import Attender, Prompting, are_shown
-from vap_core.base.errors import BadInstruction
+from vap_core.attend import Attender, AttendState, Prompting, are_shown
+from vap_core.base import media
+from vap_core.base.errors import BadInstruction, BadPhoto
 from vap_core.base.events import describe_rejection, is_shared
-from vap_core.base.files import writing
-from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, value
+from vap_core.base.files import file_fault, writing
+from vap_core.base.media import load_photo, photos_in
+from vap_core.base.pictures import (
+    ELECTED,
+    ELECTED_CASING,
+    FRAME,
+    empty_figure,
+    vote_picture,
+    write_png,
+)
+from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
+from vap_core.memory import load_bank
+from vap_core.perception.protocols import Stack
+from vap_core.perception.stacks import load_own
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 CAMERA = "image"
 GROUND_SIDE = 2560
@@ -91,22 +110,13 @@ def ground_image(
     Raises: as `load_own`, `Parsing.load` and `Attender.start`; BadMemory for a memory that is
         damaged or of another encoder.
     """
-    from vap_core.memory import load_bank
     from vap_core.perception.boxes import TiledDetector
     from vap_core.perception.stacks import load_own
 
     models = load_own(stack)
     if tiles and boxes is None:
         models = replace(models, detector=TiledDetector(models.detector))
-    bank = load_bank(memory, models.encoder.name)
-    parsing = parsing or Parsing()
-    attender = Attender(
-        models,
-        bank,
-        Prompting(always_tint=always_tint),
-        parser=parsing.load(memory, bank),
-        speaker=parsing.speaker,
-    )
+    attender, bank = _attender(memory, models, parsing, always_tint)
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)
     matched = tuple(bank[grounding.object] for grounding in attended.groundings[CAMERA])
@@ -116,6 +126,17 @@ def ground_image(
         objects=matched,
         attended=attended,
     )
+
+
+def _attender(
+    memory: Path, models: Stack, parsing: Parsing | None, always_tint: bool
+) -> tuple[Attender, Mapping[str, PersonalObject]]:
+    """The method with the remembered objects of a bank, and those."""
+    bank = load_bank(memory, models.encoder.name)
+    parsing = parsing or Parsing()
+    prompting = Prompting(always_tint=always_tint)
+    parser = parsing.load(memory, bank)
+    return Attender(models, bank, prompting, parser=parser, speaker=parsing.speaker), bank
 
 
 def missing_threshold(stack: str) -> str:
@@ -159,8 +180,6 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
 
     An earlier answer is kept, and the new one gets a number. Raises: BadOutput.
     """
-    from vap_core.analysis.plots import grounding_figure
-    from vap_core.base.pictures import write_png
     from vap_core.recording import record_grounding
 
     first = found.attended.groundings[CAMERA][0]
@@ -292,3 +311,217 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         f"{ballot.cosine_margin:.3f} in {measure}"
     )
     return lines
+
+
+LABEL_ROOM = 0.07
+"""Share of a picture's height that the number of a candidate takes."""
+VOTE_CELL_PX = 110
+"""Side of a cell of the vote's picture in a figure."""
+
+
+def grounding_figure(
+    rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str
+) -> "Figure":
+    """One row per target: the candidates, the policy's image, and the picture of the vote."""
+    votes = []
+    for grounding, obj in zip(attended.groundings[camera], objects, strict=True):
+        votes.append(vote_picture(grounding, rgb, obj.crops, cell_px=VOTE_CELL_PX, dark=False))
+    aspects = [vote.shape[1] / vote.shape[0] for vote in votes]
+    figure = empty_figure(7.8 + 3.9 * max(aspects), 3.9 * len(objects))
+    rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]
+    for row, grounding, vote in zip(rows, attended.groundings[camera], votes, strict=True):
+        left, middle, right = row.subplots(1, 3, width_ratios=[1, 1, max(aspects)])
+        candidates(left, rgb, grounding)
+        left.set_title(f'candidates for "{grounding.candidates.phrase}"', pad=14)
+        middle.imshow(attended.images[camera])
+        middle.set_title(f'shown to the policy\n"{attended.text}"')
+        right.imshow(vote)
+        for axes in (left, middle, right):
+            axes.set_axis_off()
+    return figure
+
+
+def candidates(axes: "Axes", rgb: Rgb, grounding: Grounding) -> None:
+    """Draw every candidate box over the picture, the elected one in white."""
+    from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
+
+    axes.imshow(rgb)
+    for i, (x0, y0, x1, y1) in enumerate(grounding.candidates.xyxy):
+        colour = FRAME
+        box = Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.5)
+        if i == grounding.winner:
+            colour = ELECTED
+            box.set(edgecolor=colour, linewidth=2.5)
+            box.set_path_effects([withStroke(linewidth=5, foreground=ELECTED_CASING)])
+        axes.add_patch(box)
+        above = y0 > LABEL_ROOM * len(rgb)  # else the number would cover the title
+        axes.text(
+            x0 if above else x0 + 2,
+            y0 - 2 if above else y0 + 2,
+            f"#{i}",
+            color="black",
+            fontsize=8,
+            va="bottom" if above else "top",
+            bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.5},
+        )
+
+
+CLIP = "clip"
+SIDE = 640
+"""The longer side to which frames are shrunk."""
+FOLDER_HZ = 10.0
+"""Frames a second that a folder of pictures is taken for."""
+RETRY = 5
+"""While the object is not in view, every so many frames are grounded."""
+SPANS = 6
+"""A summary names as many stretches without the object; of others it gives the number."""
+
+
+@value
+class ClipSummary:
+    """What was found in a clip: the frame it was grounded in, and those in which it was tracked.
+
+    `notes` are the warnings of that frame about two targets that are one object.
+    """
+
+    frames: int
+    grounded: int | None
+    tracked: int
+    lost: tuple[tuple[int, int], ...]
+    text: str
+    object: str
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.grounded is None:
+            return f"not in view in any of {self.frames} frames; nothing is highlighted"
+        lines = [
+            f"grounded in frame {self.grounded} of {self.frames}; tracked in {self.tracked} frames"
+        ]
+        if self.lost:
+            spans = ", ".join(f"{first}-{last}" for first, last in self.lost[:SPANS])
+            more = len(self.lost) - SPANS
+            also = f" and {more} more" if more > 0 else ""
+            lines.append(f"not visible in frames {spans}{also}")
+        lines.append(f"instruction: {self.text}")
+        return "\n".join(lines)
+
+
+def is_clip(path: Path) -> bool:
+    """Whether `ground` is asked to follow a clip: a video, or a folder of frames.
+
+    What cannot be looked at is no folder.
+    """
+    return os.path.isdir(path) or media.is_video(path)
+
+
+def ground_clip(
+    path: Path,
+    instruction: str,
+    memory: Path,
+    stack: str,
+    out: Path,
+    *,
+    objects: Sequence[str] | None = None,
+    parsing: Parsing | None = None,
+    always_tint: bool = False,
+) -> tuple[ClipSummary, Path, Path]:
+    """Follow the first target of `instruction` through a clip; write an .rrd and an .mp4.
+
+    `always_tint` is Prompting's.
+
+    Raises: BadPhoto, BadInstruction, UnknownName, BadOutput.
+    """
+    frames, hz = _open(path)
+    first = next(frames, None)
+    if first is None:
+        raise BadPhoto(f"ground: {path} has no frame; film for some seconds.")
+    attender, _ = _attender(memory, load_own(stack), parsing, always_tint)
+    with claimed_paths(out, path.stem, ".mp4") as (mp4, rrd):
+        found = _follow(attender, chain([first], frames), hz, instruction, objects, mp4, rrd)
+    return found, rrd, mp4
+
+
+def _follow(
+    attender: Attender,
+    frames: Iterable[Rgb],
+    hz: float,
+    instruction: str,
+    objects: Sequence[str] | None,
+    mp4: Path,
+    rrd: Path,
+) -> ClipSummary:
+    """Ground, track, and write every frame; until something is highlighted, every RETRY-th frame is
+    grounded.
+    """
+    from vap_core.recording import ClipRecorder, ClipStep
+
+    _, (obj, *_) = attender.understand(instruction, objects)
+    grounded, visible, text = None, [], instruction
+    notes: tuple[str, ...] = ()
+    with ExitStack() as files:
+        recorder = files.enter_context(ClipRecorder(rrd, CLIP, obj.name, hz))
+        film = files.enter_context(media.Mp4(mp4, hz))
+        state: AttendState | None = None
+        for number, rgb in enumerate(frames):
+            track, prompted = Track(None, 0.0), rgb
+            attended: Attended | None = None
+            if state is not None:
+                state, attended = attender.step(state, {CLIP: rgb})
+            elif number % RETRY == 0:
+                started, attended = attender.start({CLIP: rgb}, instruction, objects=objects)
+                is_first = attended.groundings[CLIP][0].winner is not None
+                if is_first or number == 0:
+                    about = (attended.groundings[CLIP][0], obj, instruction, attended.text)
+                    recorder.ground(number, number / hz, rgb, *about)
+                if is_first:
+                    state, grounded, text = started, number, attended.text
+                    notes = shared_targets(attended)
+            if attended is not None:
+                track = attended.tracks[CLIP][0]
+                prompted = rgb if state is None else attended.images[CLIP]
+            visible.append(track.mask is not None)
+            recorder.add(ClipStep(number, number / hz, rgb, prompted, track))
+            film.add(prompted)
+    lost = () if grounded is None else _spans(visible, grounded)
+    return ClipSummary(len(visible), grounded, sum(visible), lost, text, obj.name, notes)
+
+
+def _open(path: Path) -> tuple[Iterator[Rgb], float]:
+    """The frames of a video or of a folder, and how many there are a second. Raises: BadPhoto."""
+    if not os.path.isdir(path):
+        hz = 1.0 if file_fault(path) else media.frame_rate(path)
+        return media.frames(path, SIDE), hz
+    photos = photos_in(path)
+    if not photos:
+        raise BadPhoto(f"ground: {path} holds no picture; name a folder of frames.")
+    return _of_one_size(photos), FOLDER_HZ
+
+
+def _of_one_size(photos: Sequence[Path]) -> Iterator[Rgb]:
+    """The pictures of a folder. Raises: BadPhoto for one of another size than the first."""
+    size: tuple[int, ...] = ()
+    for photo in photos:
+        rgb = load_photo(photo, SIDE)
+        size = size or rgb.shape
+        if rgb.shape != size:
+            raise BadPhoto(
+                f"ground: {photo} has another shape than the first frame "
+                f"({rgb.shape[1]}x{rgb.shape[0]} and {size[1]}x{size[0]} pixels, shrunk); "
+                "frames have one size. Name single pictures one by one."
+            )
+        yield rgb
+
+
+def _spans(visible: Sequence[bool], grounded: int) -> tuple[tuple[int, int], ...]:
+    """First and last frame of every stretch without the object, once it was grounded."""
+    spans: list[tuple[int, int]] = []
+    for number in range(grounded, len(visible)):
+        if visible[number]:
+            continue
+        if spans and spans[-1][1] == number - 1:
+            spans[-1] = (spans[-1][0], number)
+        else:
+            spans.append((number, number))
+    return tuple(spans)

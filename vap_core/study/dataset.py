@@ -6,45 +6,31 @@ There is no ground truth: what can be told is whether views elect something and 
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from vap_core import __version__
 from vap_core.attend import Attender, AttendState
-from vap_core.base.errors import BadDataset, BadOutput
-from vap_core.base.files import Rows, align, parse_json, write_atomic, writing
-from vap_core.base.types import Attended, PersonalObject, value
+from vap_core.base.errors import BadDataset
+from vap_core.base.files import write_atomic, writing
+from vap_core.base.types import Attended, PersonalObject
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import checksums, load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
+from vap_core.study import store
+from vap_core.study.measurement import Row
+from vap_core.study.table import printed
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CALLER = "inspect-dataset"
 TABLE = "views.csv"
-
-
-@value
-class ViewReport:
-    """One camera of one episode.
-
-    `grounded` says whether the first frame has the object here, `likeness` how like the references
-    the best candidate is, `margin` the vote's. Of `frames` it is tracked in `tracked`; `losses` are
-    the stretches without it after it was grounded, `longest` the frames of the longest.
-    """
-
-    episode: int
-    camera: str
-    frames: int
-    grounded: bool
-    likeness: float
-    margin: float
-    tracked: int
-    losses: int
-    longest: int
 
 
 def inspect_dataset(
@@ -59,8 +45,13 @@ def inspect_dataset(
     episodes: int | None = None,
     copy: Path | None = None,
     masks: bool = False,
-) -> list[ViewReport]:
+) -> list[Row]:
     """Ground and track the first `episodes` episodes (None: all) of a dataset.
+
+    A row is one camera of one episode: `grounded` says whether the first frame has the object here,
+    `likeness` how like the references the best candidate is, `margin` the vote's. Of `frames` it is
+    tracked in `tracked`; `losses` are the stretches without it after it was grounded, `longest` the
+    frames of the longest.
 
     Writes a recording of each into `out`, and the table; with `copy` the dataset with prompted
     pictures and rewritten tasks, and with `masks` the target's masks in it. Interrupted, the same
@@ -88,23 +79,21 @@ def inspect_dataset(
     }
     if speaker:
         about["speaker"] = speaker
-    _check_folder(out, about)
-    reports: list[ViewReport] = []
+    store.open_run(out, about)
+    reports: list[Row] = []
     with ExitStack() as files:
+        files.enter_context(store.locked(out))
         writer = None if copy is None else files.enter_context(Copy(recorded, copy, masks))
         for episode in tqdm(range(count), unit="episode"):
             done = out / f"episode_{episode:06d}.json"
-            found = _read_reports(done)
-            if found is None or writer is not None:
+            if writer is not None or not (done.is_file() and done.with_suffix(".rrd").is_file()):
                 found = _inspect_episode(
                     recorded, episode, attender, instruction, objects, out, writer
                 )
-                text = json.dumps([asdict(report) for report in found])
-                with writing(out, CALLER):
-                    write_atomic(done, text.encode())
-            reports += found
+                store.write_json_part(done, found, CALLER)
+            reports += store.read_json_part(done, CALLER)
     with writing(out, CALLER):
-        write_atomic(out / TABLE, _csv(reports).encode())
+        write_atomic(out / TABLE, printed(_shown(reports), "csv").encode())
     return reports
 
 
@@ -119,54 +108,36 @@ def _check_one_task(recorded: Recorded, episodes: int) -> None:
         )
 
 
-def report_table(reports: Iterable[ViewReport]) -> str:
+def report_table(reports: Sequence[Row]) -> str:
     """Every view that lost the object, or did not find it; and the totals."""
-    rows: list[list[str]] = [_HEADER]
-    seen = list(reports)
-    for report in seen:
-        if not report.grounded or report.losses:
-            rows.append(_cells(report))
-    lines = []
-    if len(rows) > 1:
-        lines.append(align(rows))
-    grounded = [report for report in seen if report.grounded]
-    frames = sum(report.frames for report in grounded)
-    tracked = sum(report.tracked for report in grounded)
-    lines.append(
-        f"{len(grounded)} of {len(seen)} views find the object in their first frame; these track "
-        f"it in {tracked} of {frames} frames, with {sum(r.losses for r in grounded)} losses"
+    shown = [row for row in reports if not row["grounded"] or row["losses"]]
+    grounded = [row for row in reports if row["grounded"]]
+    frames, tracked, losses = (
+        sum(row[name] for row in grounded) for name in ("frames", "tracked", "losses")
     )
-    return "\n".join(lines)
+    totals = (
+        f"{len(grounded)} of {len(reports)} views find the object in their first frame; these "
+        f"track it in {tracked} of {frames} frames, with {losses} losses"
+    )
+    return "\n".join([*([printed(_shown(shown))] if shown else []), totals])
 
 
-_HEADER = [
-    "episode",
-    "camera",
-    "found",
-    "likeness",
-    "margin",
-    "tracked",
-    "losses",
-    "longest",
-]
+def _shown(rows: Sequence[Row]) -> "pd.DataFrame":
+    import pandas as pd
 
-
-def _cells(report: ViewReport) -> list[str]:
-    return [
-        str(report.episode),
-        report.camera,
-        "yes" if report.grounded else "no",
-        f"{report.likeness:.2f}",
-        f"{report.margin:.2f}",
-        f"{report.tracked}/{report.frames}",
-        str(report.losses),
-        str(report.longest),
-    ]
-
-
-def _csv(reports: Sequence[ViewReport]) -> str:
-    rows: Rows = [_HEADER, *map(_cells, reports)]
-    return "".join(",".join(row) + "\n" for row in rows)
+    return pd.DataFrame(
+        {
+            "episode": row["episode"],
+            "camera": row["camera"],
+            "found": "yes" if row["grounded"] else "no",
+            "likeness": f"{row['likeness']:.2f}",
+            "margin": f"{row['margin']:.2f}",
+            "tracked": f"{row['tracked']}/{row['frames']}",
+            "losses": row["losses"],
+            "longest": row["longest"],
+        }
+        for row in rows
+    )
 
 
 def _inspect_episode(
@@ -177,7 +148,7 @@ def _inspect_episode(
     objects: Sequence[str] | None,
     out: Path,
     writer: Copy | None,
-) -> list[ViewReport]:
+) -> list[Row]:
     """Ground, track, record and perhaps copy one episode."""
     from vap_core.recording import DatasetRecorder
 
@@ -207,25 +178,15 @@ def _inspect_episode(
         writer.end_episode()
     reports = []
     for camera, seen in visible.items():
-        reports.append(_report(episode, camera, first, seen))
+        grounding = first.groundings[camera][0]
+        chosen = grounding.chosen
+        stretches = _stretches(seen) if grounding.winner is not None else []
+        row: Row = {"episode": episode, "camera": camera, "frames": len(seen)}
+        row |= {"grounded": grounding.winner is not None, "margin": float(grounding.ballot.margin)}
+        row["likeness"] = 0.0 if chosen is None else float(grounding.likeness[chosen])
+        row |= {"tracked": sum(seen), "losses": len(stretches)}
+        reports.append({**row, "longest": max(stretches, default=0)})
     return reports
-
-
-def _report(episode: int, camera: str, first: Attended, seen: Sequence[bool]) -> ViewReport:
-    grounding = first.groundings[camera][0]
-    chosen = grounding.chosen
-    stretches = _stretches(seen) if grounding.winner is not None else []
-    return ViewReport(
-        episode=episode,
-        camera=camera,
-        frames=len(seen),
-        grounded=grounding.winner is not None,
-        likeness=0.0 if chosen is None else float(grounding.likeness[chosen]),
-        margin=float(grounding.ballot.margin),
-        tracked=sum(seen),
-        losses=len(stretches),
-        longest=max(stretches, default=0),
-    )
 
 
 def _stretches(seen: Sequence[bool]) -> list[int]:
@@ -249,35 +210,3 @@ def _memory_digest(bank: Mapping[str, PersonalObject]) -> str:
         digest.update(json.dumps(about).encode())
         digest.update(obj.embeddings.tobytes())
     return digest.hexdigest()[:16]
-
-
-def _check_folder(out: Path, about: Mapping[str, Any]) -> None:
-    """Begin in `out`, or go on there with the same question. Raises: BadOutput."""
-    file = out / "inspection.json"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if file.is_file():
-            found = dict(parse_json(file.read_text()))
-            keys = dict.fromkeys([*about, *found])
-            differing = [key for key in keys if found.get(key) != about.get(key)]
-            if differing:
-                raise BadOutput(
-                    f"inspect-dataset: {out} holds another inspection ({', '.join(differing)} "
-                    "differ); choose another --out."
-                )
-            return
-        write_atomic(file, json.dumps(about).encode())
-    except (OSError, ValueError, TypeError) as error:
-        raise BadOutput(
-            f"inspect-dataset: {out} cannot be used ({error}); choose another --out."
-        ) from error
-
-
-def _read_reports(done: Path) -> list[ViewReport] | None:
-    """The reports of an episode that was inspected; None where it was not."""
-    if not done.is_file() or not done.with_suffix(".rrd").is_file():
-        return None
-    try:
-        return [ViewReport(**fields) for fields in parse_json(done.read_text())]
-    except (ValueError, TypeError):
-        return None

@@ -1,5 +1,0 @@
-"""Figures and measurements that the notebooks call; names load when they are first used."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
