@@ -246,16 +246,6 @@ def test_a_call_that_is_made_again_or_audited_leaves_the_memory_as_it_was(polici
     assert np.array_equal(np.stack(audited), plain)
 
 
-def test_a_smaller_picture_is_scaled_to_the_checkpoints_size(policies):
-    policy, side = policies["act"], look(0, side=64)
-    double = PolicyInput(
-        {"front": side.images["front"].repeat(2, axis=0).repeat(2, axis=1)}, side.text, side.state
-    )
-    assert np.allclose(
-        run(policy, begin(policy, 1), [side]), run(policy, begin(policy, 1), [double]), atol=1e-3
-    )
-
-
 def test_what_does_not_fit_is_one_line(policies):
     policy, seen = policies["act"], look(0)
     wants = r"act:act@\w{8} wants observation.images.front, observation.state \(13\); there is observation.images."

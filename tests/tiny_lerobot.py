@@ -106,6 +106,17 @@ def act(folder: Path, side: int = 64, **how: Any) -> Path:
     return _saved(folder, config, ACTPolicy)
 
 
+def act_without_state(folder: Path) -> Path:
+    """It reads the image alone."""
+    features = _features(64)
+    del features["input_features"]["observation.state"]
+    config = ACTConfig(
+        **features, device="cpu", pretrained_backbone_weights=None, dim_model=32, n_heads=4, dim_feedforward=32,
+        n_encoder_layers=1, n_vae_encoder_layers=1, chunk_size=3, n_action_steps=3,
+    )  # fmt: skip
+    return _saved(folder, config, ACTPolicy)
+
+
 def vqbet(folder: Path) -> Path:
     """It looks back: queues hold its last three observations, and what is left of a chunk."""
     kept = dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.MEAN_STD)

@@ -251,24 +251,18 @@ class LeRobot:
         return reporting_attention(self.policy, self.cameras(), places)
 
     def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
-        """What lerobot's loop would hand to the preprocessor.
+        """What lerobot's loop would hand to the preprocessor, equal to the bit.
 
-        Images are floats in 0..1, B x C x H x W.
+        Every camera's images as they are, floats in 0..1, B x C x H x W: a policy that wants
+        another size scales or pads them itself. The state, whether or not it is declared.
         """
         self.check(list(inputs[0].images), len(inputs[0].state), self.action_size)
         observation: dict[str, Any] = {"task": [policy_input.text for policy_input in inputs]}
-        for key, shape in self.wanted.items():
-            if key == STATE:
-                observation[key] = torch.from_numpy(np.stack([each.state for each in inputs]))
-            else:
-                camera = key.removeprefix(IMAGE)
-                rgb = np.stack([policy_input.images[camera] for policy_input in inputs])
-                images = torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 255
-                if images.shape[-2:] != shape[-2:]:  # as large as the checkpoint was trained on
-                    images = torch.nn.functional.interpolate(
-                        images, shape[-2:], mode="bilinear", antialias=True
-                    )
-                observation[key] = images
+        for camera in inputs[0].images:
+            rgb = np.stack([policy_input.images[camera] for policy_input in inputs])
+            images = torch.from_numpy(rgb).permute(0, 3, 1, 2).contiguous()
+            observation[IMAGE + camera] = images.float() / 255
+        observation[STATE] = torch.from_numpy(np.stack([each.state for each in inputs]))
         return observation
 
     def _report_inputs(self, batch: dict[str, Any], episodes: Sequence[int]) -> None:
@@ -284,7 +278,7 @@ class LeRobot:
                 rows = [
                     tokens[mask] for tokens, mask in zip(tensor, batch[TOKEN_MASK], strict=True)
                 ]
-            elif key.startswith(IMAGE):
+            elif key.startswith(IMAGE) and key in self.policy.config.input_features:
                 name = self._camera(key)
                 rows = list(tensor)
             else:
