@@ -14,13 +14,14 @@ from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import BENCHMARKS, benchmarks, development, lists
+from vap_core.simulation.suites import BENCHMARKS, lists
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import stats
 from vap_core.study.engine import weights_by_suite
 from vap_core.study.trials import Study, shipped
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES
+from vap_make.lists import benchmarks, development
 
 TASK = ("simpler-bridge-absent", "put-camera")
 

@@ -16,9 +16,10 @@ from vap_core.instruction import parse
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.grasps import points_world
-from vap_core.simulation.suites import BENCHMARKS, SHARED, VARIANTS, benchmarks, lists
+from vap_core.simulation.suites import BENCHMARKS, SHARED, VARIANTS, lists
 from vap_core.simulation.suites.suite import AGGREGATION, MATCHING
 from vap_core.simulation.types import AS_LISTED
+from vap_make.lists import benchmarks
 
 BUILDERS = {
     "simpler-fractal": benchmarks.fractal_rows,

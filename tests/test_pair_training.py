@@ -18,11 +18,12 @@ from vap_core.policies.protocol import SHIPPED
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import Task, shared, suite
+from vap_core.simulation.suites import Task, suite
 from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.suites.rules import NEAR_M
 from vap_make.films import demonstrations, pairs
 from vap_make.films.demonstrations import Film
+from vap_make.lists import shared
 from vap_make.policy import start, train
 from vap_make.policy.commands import Command, Known, command, phrase_pair
 from vap_make.recipe import RECIPES, every, filmed_tasks

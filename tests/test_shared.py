@@ -23,6 +23,7 @@ from vap_core.simulation.types import Owned
 from vap_core.study.engine import result_key
 from vap_core.study.report import suites_table
 from vap_core.study.trials import Study, shipped
+from vap_make.lists import shared as drawn
 
 
 def memory(row):
@@ -59,7 +60,7 @@ def test_a_list_has_twenty_layouts_a_task_and_is_its_builders(name):
         mine = [row for row in rows if row.task == task.name]
         assert len(mine) == (24 if name == "shared-sequence-bridge" else 20)
         for episode in (0, 7, len(mine) - 1):
-            assert asdict(shared.row(name, task, episode)) == asdict(mine[episode])
+            assert asdict(drawn.row(name, task, episode)) == asdict(mine[episode])
 
 
 def test_the_table_of_suites_has_lists_and_hashes(name):
@@ -184,13 +185,13 @@ def test_keys_of_other_results_are_as_before():
 def test_a_layout_that_was_drawn_again_is_another_and_no_other_row_changes(name, monkeypatch):
     again = {}
     for task in shared.TASKS[name]:
-        for episode, draw in shared.REDRAWN.get(task.name, {}).items():
+        for episode, draw in drawn.REDRAWN.get(task.name, {}).items():
             assert draw == 1
             again[f"{name}.{task.name}.{episode:03d}"] = lists.to_line(
-                shared.row(name, task, episode)
+                drawn.row(name, task, episode)
             )
-    monkeypatch.setattr(shared, "REDRAWN", {})
-    first = {row.key: lists.to_line(row) for row in shared.rows(name)}
+    monkeypatch.setattr(drawn, "REDRAWN", {})
+    first = {row.key: lists.to_line(row) for row in drawn.rows(name)}
     for row in lists.read(name):
         line = lists.to_line(row)
         assert line == again.get(row.key, first[row.key])

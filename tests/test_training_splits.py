@@ -8,12 +8,13 @@ import pytest
 from vap_core.base.errors import UnknownName
 from vap_core.base.files import DATA
 from vap_core.simulation.looks import DEFAULT_STYLE
-from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark, benchmarks
+from vap_core.simulation.suites import BENCHMARKS, VARIANTS, benchmark
 from vap_core.simulation.suites.suite import Variant
 from vap_make.films import looks
 from vap_make.films.demonstrations import DISTRACTORS, draw_objects
 from vap_make.films.looks import APART, FIRST_GRAIN, distance, draw_look
 from vap_make.films.scenes import TRAIN_INSTANCES, draw_style
+from vap_make.lists import benchmarks
 from vap_make.recipe import FILMED, RECIPES, filmed_task, filmed_tasks
 
 

@@ -14,8 +14,10 @@ from typing import Any
 
 from vap_core.base.errors import one_of
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.suites import Task, benchmarks, suite
+from vap_core.simulation.suites import Task, suite
+from vap_core.simulation.suites.benchmarks import BRIDGE, FRACTAL
 from vap_core.simulation.suites.layout import Area
+from vap_make.lists import benchmarks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,14 +155,14 @@ def _instead(task: Task, category: str) -> Task:
 FILMED: dict[str, Filmed] = {
     "simpler-bridge": Filmed(
         area=benchmarks.FILMED_AREA,
-        instead=(_instead(benchmarks.BRIDGE.task("put-owl-figurine"), "vase"),),
+        instead=(_instead(BRIDGE.task("put-owl-figurine"), "vase"),),
         most=4,
     ),
     "simpler-fractal": Filmed(
         area=benchmarks.DESK,
         instead=(
-            _instead(benchmarks.FRACTAL.task("move-bottle-near-coke-can"), "vase"),
-            _instead(benchmarks.FRACTAL.task("move-bottle-near-coke-can"), "straw cup"),
+            _instead(FRACTAL.task("move-bottle-near-coke-can"), "vase"),
+            _instead(FRACTAL.task("move-bottle-near-coke-can"), "straw cup"),
         ),
         distractors=0.3,
     ),

@@ -5,6 +5,4 @@ from .occluder import Occlusion as Occlusion
 from .studio import Stage as Stage
 from .suites import SUITES as SUITES
 from .suites import VARIANTS as VARIANTS
-from .suites import benchmarks as benchmarks
-from .suites import development as development
 from .suites import lists as lists

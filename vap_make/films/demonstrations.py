@@ -26,7 +26,7 @@ from vap_core.rollout.running import expert_steps
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene, build
-from vap_core.simulation.suites import Suite, Task, benchmarks, suite
+from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.layout import Area, Spot, place, radius_m, random_yaw, scatter
 from vap_core.simulation.suites.open_row import make_env
 from vap_core.simulation.types import EpisodeRow, Placement
@@ -34,6 +34,7 @@ from vap_make.films import pairs
 from vap_make.films.looks import draw_look
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_make.folder import kept_arrays
+from vap_make.lists import benchmarks
 from vap_make.objects import generic_instance
 from vap_make.recipe import FILMED, RECIPES, every, filmed_tasks
 

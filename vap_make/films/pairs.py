@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vap_core.simulation.suites import Suite, Task, shared
+from vap_core.simulation.suites import Suite, Task
 from vap_core.simulation.suites.layout import place_at_random_yaws
 from vap_core.simulation.types import EpisodeRow
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
+from vap_make.lists import shared
 from vap_make.objects import generic_instance
 
 EACH = 2

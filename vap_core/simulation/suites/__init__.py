@@ -17,7 +17,7 @@ import numpy as np
 from vap_core.base.errors import BadSuite, UnknownName, one_of
 from vap_core.simulation import robots
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import development, layout, lists, own, shared, starts
+from vap_core.simulation.suites import layout, lists, own, shared, starts
 from vap_core.simulation.suites.benchmarks import BRIDGE, FRACTAL, TABLETOP, VLABENCH
 from vap_core.simulation.suites.rules import Judge as Judge
 from vap_core.simulation.suites.suite import VARIANTS as VARIANTS
@@ -35,11 +35,13 @@ WARM_UPS: dict[str, Suite] = {"widowx-pick": layout.WIDOWX, "franka-pick": layou
 SHARED: dict[str, Suite] = shared.SUITES
 """Scenes that two people share: two objects in turn, or two at once."""
 SUITES: dict[str, Suite] = {**BENCHMARKS, **SHARED, **WARM_UPS}
+DEVELOPMENT = "-dev"
+"""Ends the name of a suite to tune on, beside each benchmark."""
 ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
 RED = objects.RED
 """Ends the name of a suite whose first look-alike is red by nature; -absent may follow it."""
-ENDINGS = (ABSENT, RED, development.SUFFIX)
+ENDINGS = (ABSENT, RED, DEVELOPMENT)
 """No suite of one's own ends so."""
 
 
@@ -70,7 +72,7 @@ def benchmark_name(name: str) -> str:
 
     Of a shared scene, the benchmark whose robot and frozen policy it has.
     """
-    return shared.LIKE.get(name) or list_name(name).removesuffix(development.SUFFIX)
+    return shared.LIKE.get(name) or list_name(name).removesuffix(DEVELOPMENT)
 
 
 def is_listed(name: str) -> bool:
@@ -109,7 +111,7 @@ def has_list(name: str) -> bool:
 
 
 def is_development(name: str) -> bool:
-    return is_listed(name) and list_name(name).endswith(development.SUFFIX)
+    return is_listed(name) and list_name(name).endswith(DEVELOPMENT)
 
 
 def digest(name: str) -> str:

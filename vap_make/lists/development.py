@@ -11,7 +11,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from vap_core.simulation.suites import benchmarks
+from vap_core.simulation.suites import DEVELOPMENT
 from vap_core.simulation.suites.layout import (
     Spot,
     nearest_m,
@@ -23,8 +23,8 @@ from vap_core.simulation.suites.layout import (
 )
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import EpisodeRow, Placement
+from vap_make.lists import benchmarks
 
-SUFFIX = "-dev"
 INSTANCE = 9501
 """The personal object of every kind: training shows instances below 400, and from 100,000 on. (The
 straw cup 9500 is too wide for the WidowX.)"""
@@ -40,7 +40,7 @@ type Layout = Callable[[np.random.Generator, Task, int, list[str]], tuple[Placem
 def rows(known: Suite) -> tuple[EpisodeRow, ...]:
     """The development list of a benchmark."""
     layout, episodes = LAYOUTS[known.name]
-    tuned_on = replace(known, name=f"{known.name}{SUFFIX}")
+    tuned_on = replace(known, name=f"{known.name}{DEVELOPMENT}")
     listed = []
     for task, episode in product(known.tasks, range(episodes)):
         rng = np.random.default_rng([81, *f"{known.name} {task.name}".encode(), episode])
@@ -81,9 +81,8 @@ def _desk(
     if task.goal:
         return _around_the_goal(rng, task, episode, names)
     steps = benchmarks.GRID - 1
-    grid = []
-    for i, j in product(range(steps), repeat=2):
-        grid.append(benchmarks.DESK.at((i + 0.5) / steps, (j + 0.5) / steps))
+    cells = product(range(steps), repeat=2)
+    grid = [benchmarks.DESK.at((i + 0.5) / steps, (j + 0.5) / steps) for i, j in cells]
     taken = [grid[episode % len(grid)]]
     for i in rng.permutation(len(grid)).tolist():
         if len(taken) < 3 and nearest_m(grid[i], taken) > benchmarks.BESIDE_M:
