@@ -15,7 +15,7 @@ from typing import Any
 from vap_core.base.errors import one_of
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
-from vap_core.simulation.suites.benchmarks import BRIDGE, FRACTAL
+from vap_core.simulation.suites.benchmarks import BRIDGE, FILMED_AREA, FRACTAL
 from vap_core.simulation.suites.layout import Area
 from vap_make.lists import benchmarks
 
@@ -154,7 +154,7 @@ def _instead(task: Task, category: str) -> Task:
 
 FILMED: dict[str, Filmed] = {
     "simpler-bridge": Filmed(
-        area=benchmarks.FILMED_AREA,
+        area=FILMED_AREA,
         instead=(_instead(BRIDGE.task("put-owl-figurine"), "vase"),),
         most=4,
     ),

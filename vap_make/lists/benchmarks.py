@@ -30,8 +30,6 @@ from vap_core.simulation.types import EpisodeRow, Placement
 
 DESK = Area(x0=0.40, x1=0.63, y0=-0.22, y1=0.22)
 """The Google Robot's grid: 23 cm deep, 44 cm wide."""
-FILMED_AREA = Area(0.18, 0.35, -0.095, 0.095)
-"""Where the films of simpler-bridge's policies show objects."""
 GRID = 5
 ORIENTATIONS = 3
 LAYOUTS = 40

@@ -6,6 +6,7 @@ per episode. Their episodes are lists in `data/suites`; vap_make.lists drew them
 """
 
 from vap_core.simulation.looks import WEBCAM
+from vap_core.simulation.suites.layout import Area
 from vap_core.simulation.suites.suite import Suite, Task
 
 FRACTAL = Suite(
@@ -87,3 +88,5 @@ TABLETOP = Suite(
         *map(_put, ("plant", "stuffed toy", "pouch", "scrubber")),
     ),
 )
+FILMED_AREA = Area(0.18, 0.35, -0.095, 0.095)
+"""Where the films of simpler-bridge's policies show objects."""
