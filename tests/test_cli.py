@@ -13,6 +13,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from tests.command import process, refused, vap
+from vap_core.base.files import DATA
 from vap_core.cli import app
 from vap_core.instruction.context import read_uses
 from vap_core.memory import load_bank
@@ -331,3 +332,22 @@ def test_doctor_fails_where_nothing_can_be_rendered() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "MISSING" in done.stdout
+
+
+def test_what_cannot_be_shown_is_said_before_anything_is_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It was said after 25 to 60 seconds, in which the episode was run again."""
+    table = DATA / "results" / "mini_pi0.parquet"
+    words = ("diagnose", table, "--suite", "simpler-bridge", "--method", "vap", "--open", "0")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+    def run_again(*_: object, **__: object) -> None:
+        raise AssertionError("the episode is run")
+
+    monkeypatch.setattr("vap_core.study.failures.recording_to_show", run_again)
+    assert "there is no display for a window; add --png FILE" in refused(*words)
+    monkeypatch.setattr("vap_core.recording.show.has_driver", lambda: False)
+    line = refused(*words, "--png", tmp_path / "a.png")
+    assert "apt-get install -y mesa-vulkan-drivers" in line

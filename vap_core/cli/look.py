@@ -120,6 +120,7 @@ def diagnose(
     if show is None and png is None and mp4 is None:
         print(failures_text(failures, limit))
         return
+    _check_viewer(png, mp4)
     path, frame = recording_to_show(failures, number, against)
     print(f"{path}, frame {frame}: {failures.table['case_sentence'].iloc[number]}")
     _show_frame(path, frame, png, mp4)
@@ -168,6 +169,7 @@ def query(
         print(f"{len(found)} found")
         print(align(rows))
         return
+    _check_viewer(png)
     path, frame = steps.recording_at(run, found, show or 0)
     print(f"{path}, frame {frame}")
     _show_frame(path, frame, png)
@@ -258,6 +260,13 @@ def _check(recording: Path) -> None:
             f"{recording} is a recording that was not finished; once the process that makes it has "
             f"ended, `{command('view', recording, '--recover')}` saves its steps."
         ) from error
+
+
+def _check_viewer(png: Path | None, mp4: Path | None = None) -> None:
+    """Before an episode is run again to be shown. Raises: MissingGL."""
+    from vap_core.recording.show import check_viewer
+
+    check_viewer(window=png is None and mp4 is None, picture=png is not None)
 
 
 def _show_frame(

@@ -106,11 +106,7 @@ def open_viewer(rrd: Path, *, frame_index: int = 0) -> None:
     """
     rrd = Path(rrd).resolve()
     read_summary(rrd)
-    if not has_display():
-        raise MissingGL(
-            "open_viewer: there is no display; add --png FILE for a picture, "
-            f"or copy {rrd} to a machine that has one."
-        )
+    check_viewer(window=True, picture=False)
     viewer = _start_viewer()
     viewer.open(str(rrd))
     viewer.set_time("frame_index", sequence=frame_index, play_state="paused")
@@ -123,6 +119,23 @@ def has_driver() -> bool:
         return True
     roots = ("/usr/share", "/usr/local/share", "/etc", str(Path.home() / ".local/share"))
     return any(list(Path(root, "vulkan", "icd.d").glob("*.json")) for root in roots)
+
+
+def check_viewer(*, window: bool, picture: bool) -> None:
+    """Check what can be checked at once, before anything is run or loaded to be shown.
+
+    Raises: MissingGL: there is no display for a `window`, or no driver to draw a `picture`.
+    """
+    if window and not has_display():
+        raise MissingGL(
+            "view: there is no display for a window; add --png FILE for a picture, or copy the "
+            "recording to a machine that has one."
+        )
+    if picture and not has_driver():
+        raise MissingGL(
+            "view: there is no Vulkan driver to draw a picture of a recording; install a software "
+            f"driver: apt-get install -y {DRIVER}"
+        )
 
 
 def has_display() -> bool:
