@@ -15,7 +15,6 @@ from vap_core.base.types import Boxes
 from vap_core.contracts.given import noise, rendered_scene
 from vap_core.perception import text_encoder as text
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
-from vap_core.perception.embedded import backbone as features
 from vap_core.perception.embedded import encoder as embed
 from vap_core.perception.embedded import networks
 from vap_core.perception.embedded import proposer as detect
@@ -24,6 +23,7 @@ from vap_core.perception.embedded import tracker as track
 from vap_core.perception.embedded.tracker import cells
 from vap_core.perception.embedded.tracker.cells import argmax_planes
 from vap_core.perception.embedded.tracker.identities import RECENT
+from vap_make.perception import backbone as features
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def test_tracker_memory_is_bounded(scene: tuple) -> None:
 def test_missing_and_damaged_weights_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingWeights, match=r"toy\.safetensors is not on this machine"):
         networks.load_weights("toy.safetensors", folder=tmp_path)
-    networks.save_weights(
+    features.save_weights(
         "toy.safetensors", {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, {"n": 3}, tmp_path
     )
     tensors, about = networks.load_weights("toy.safetensors", "a.", tmp_path)

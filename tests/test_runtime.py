@@ -18,6 +18,7 @@ from vap_core.perception.embedded import encoder, networks, proposer, segmenter,
 from vap_core.perception.embedded.networks import FOLDER, MANIFEST, PERCEPTION, load_weights
 from vap_core.perception.embedded.tracker import cells
 from vap_make.perception import graphs
+from vap_make.perception.backbone import TorchNetwork
 
 BOUNDS = {
     cells.GRAPH: (1e-5,),
@@ -51,8 +52,8 @@ def modules() -> dict[str, nn.Module]:
 
 
 @pytest.fixture(scope="module")
-def by_torch() -> dict[str, networks.TorchNetwork]:
-    return {name: networks.TorchNetwork(module) for name, module in modules().items()}
+def by_torch() -> dict[str, TorchNetwork]:
+    return {name: TorchNetwork(module) for name, module in modules().items()}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def by_onnx() -> dict[str, networks.Network]:
 
 
 @pytest.fixture(scope="module")
-def torch_tracker(by_torch: dict[str, networks.TorchNetwork]) -> tracker.LiteTracker:
+def torch_tracker(by_torch: dict[str, TorchNetwork]) -> tracker.LiteTracker:
     return tracker.LiteTracker(
         by_torch[cells.GRAPH],
         segmenter.LiteSegmenter(by_torch[segmenter.GRAPH]),
@@ -108,7 +109,7 @@ def inputs(name: str, picture: np.ndarray, seed: int) -> list[np.ndarray]:
 @pytest.mark.parametrize("name", BOUNDS)
 def test_both_runtimes_give_the_same_numbers(
     name: str,
-    by_torch: dict[str, networks.TorchNetwork],
+    by_torch: dict[str, TorchNetwork],
     by_onnx: dict[str, networks.Network],
     scene: tuple,
 ) -> None:
@@ -125,7 +126,7 @@ def test_both_runtimes_give_the_same_numbers(
 
 
 def test_both_runtimes_give_the_same_boxes_masks_and_rows(
-    by_torch: dict[str, networks.TorchNetwork], scene: tuple
+    by_torch: dict[str, TorchNetwork], scene: tuple
 ) -> None:
     rgb, _, boxes = scene
     reference = proposer.LiteDetector(by_torch[proposer.GRAPH], proposer.load().known)

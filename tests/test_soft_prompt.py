@@ -16,7 +16,7 @@ from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining, photographs
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
-from vap_core.policies.mini_pi0.vlm import MiniVlm, initialise_policy, load_vlm
+from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
 from vap_core.policies.protocol import SHIPPED
 from vap_core.rollout.prompters import TextPrompter, soft_prompt
 from vap_core.simulation import suites
@@ -28,6 +28,7 @@ from vap_core.study import engine, trials
 from vap_core.study.engine import run_job
 from vap_core.study.methods import make_prompter
 from vap_core.study.trials import Study
+from vap_make.policy.start import initialise_policy
 from vap_make.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7

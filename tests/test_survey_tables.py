@@ -200,7 +200,7 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
         ">= 97",
         "K = 7, average",
         "simpler-fractal head",
-        "x backbone pass",
+        "x encoder pass",
         "left out: simpler-fractal 0 of 2",
     ):
         assert told in done.stdout

@@ -370,19 +370,15 @@ def _check_poses(
             f"{', '.join(missing)} (given: {', '.join(cameras) or 'none'}), or ground every view "
             "by itself (Prompting.associate=None)."
         )
-    for view in views:
-        fault = _pose_fault(cameras[view])
+    faults = {view: _pose_fault(cameras[view]) for view in views}
+    if not any(faults.values()) and all(_looks_away(cameras[view]) for view in views):
+        faults[views[0]] = "looks away from the table, as all do"
+    for view, fault in faults.items():
         if fault:
-            raise _bad_pose(view, fault)
-    if all(_looks_away(cameras[view]) for view in views):
-        raise _bad_pose(views[0], "looks away from the table, as all do")
-
-
-def _bad_pose(view: str, fault: str) -> BadViews:
-    return BadViews(
-        f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV axes: x "
-        "right, y down, z ahead) to the world, in metres, with the table at z = 0."
-    )
+            raise BadViews(
+                f"Attender.start: camera {view!r} {fault}; pose_world maps the camera (OpenCV "
+                "axes: x right, y down, z ahead) to the world, in metres, with the table at z = 0."
+            )
 
 
 def _pose_fault(camera: Camera) -> str:

@@ -21,7 +21,7 @@ from typing import Any
 from unicodedata import normalize
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from vap_core.associate import Pairing, associate_targets
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews
@@ -241,9 +241,9 @@ class Attender:
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
                 offered = proposals[camera][phrase]
-                few = nominate(rgb, obj, offered, self.stack)
+                few, cosine = nominate(rgb, obj, offered, self.stack)
                 of_view.append(segment(rgb, few, self.stack, known=of_view))
-                per_target.append(self.ground(camera, obj, of_view[-1]))
+                per_target.append(self.ground(camera, obj, of_view[-1], cosine))
             candidates[camera] = tuple(of_view)
             groundings[camera] = tuple(per_target)
 
@@ -285,22 +285,23 @@ class Attender:
         once = {obj.name: obj.first(self.prompting.references) for obj in wanted}
         return parsed, list(once.values())
 
-    def ground(self, camera: str, obj: PersonalObject, candidates: Candidates) -> Grounding:
-        """The vote of one view for one object.
+    def ground(
+        self,
+        camera: str,
+        obj: PersonalObject,
+        candidates: Candidates,
+        cosine: Float32[np.ndarray, "n k"] | None = None,
+    ) -> Grounding:
+        """The vote of one view for one object; `cosine` is `compare`'s, where that is known.
 
         Raises: BadEncoder, as `vote.compare` does.
         """
         boxes = candidates.boxes
-        cosine = compare(obj, candidates, self.stack)
+        if cosine is None:
+            cosine = compare(obj, candidates, self.stack)
         ballot = vote(election_scores(cosine, boxes), self.prompting.rule)
         return Grounding(
-            camera=camera,
-            object=obj.name,
-            candidates=boxes,
-            similarity=cosine,
-            ballot=ballot,
-            winner=ballot.winner,
-            masks=candidates.masks,
+            camera, obj.name, boxes, cosine, ballot, winner=ballot.winner, masks=candidates.masks
         )
 
     def reject(self, grounding: Grounding) -> Grounding:
@@ -337,7 +338,11 @@ class Attender:
         masks: dict[str, Bool[np.ndarray, "n h w"]] = {}
         tracks: dict[str, tuple[Track, ...]] = {}
         for camera in views:
-            ids[camera] = _winner_ids(candidates[camera], groundings[camera])
+            elected = zip(candidates[camera], groundings[camera], strict=True)
+            ids[camera] = tuple(
+                None if grounding.winner is None else of_target.ids[grounding.winner]
+                for of_target, grounding in elected
+            )
             masks[camera] = masks_by_id(candidates[camera])
             tracks[camera] = _first_tracks(groundings[camera], ids[camera])
 
@@ -346,7 +351,12 @@ class Attender:
         shown = {camera: are_shown(per_target) for camera, per_target in tracks.items()}
         text = parsed.text
         if self.prompting.rewrite:
-            text = rewrite(parsed, _colours_in_view(colours, shown))
+            # What no view shows is not rewritten.
+            named = [
+                colour if any(of_view[j] for of_view in shown.values()) else None
+                for j, colour in enumerate(colours)
+            ]
+            text = rewrite(parsed, named)
         state = AttendState(
             frame_index=0,
             instruction=parsed,
@@ -383,8 +393,6 @@ class Attender:
 
         Raises: BadViews, as `step`.
         """
-        trackers = []
-        images = []
         for state, images_now in zip(states, views, strict=True):
             check_views(images_now)
             if set(images_now) != set(state.groundings):
@@ -399,10 +407,9 @@ class Attender:
                         f"Attender.step: view {camera!r} is {shape[1]}x{shape[0]}, but the episode "
                         f"started with {began[1]}x{began[0]}; a view keeps its size."
                     )
-        for state, images_now in zip(states, views, strict=True):
-            for camera, tracker in state.trackers.items():
-                trackers.append(tracker)
-                images.append(images_now[camera])
+        trackers = [tracker for state in states for tracker in state.trackers.values()]
+        pairs = zip(states, views, strict=True)
+        images = [images_now[camera] for state, images_now in pairs for camera in state.trackers]
         trackers, tracks = self.stack.tracker.step(trackers, images)
 
         results = []
@@ -478,25 +485,20 @@ class Attender:
 
         Look-alikes, and a robot's hand among the candidates, are not marked: they are not followed.
         """
-        tracked = []
-        images = []
-        starts = []
-        targets = []
-        for camera, rgb in views.items():
+        targets: dict[str, list[int]] = {}
+        for camera in views:
             wanted = sorted({identity for identity in ids[camera] if identity is not None})
             if self._marks_others:
                 wanted = list(range(len(masks[camera])))
             if wanted:
-                tracked.append(camera)
-                images.append(rgb)
-                starts.append(masks[camera])
-                targets.append(wanted)
+                targets[camera] = wanted
+        images, starts = [views[c] for c in targets], [masks[c] for c in targets]
         tracker = self.stack.tracker
         if isinstance(tracker, TargetTracker):
-            states = tracker.start_targets(images, starts, targets)
+            states = tracker.start_targets(images, starts, list(targets.values()))
         else:
             states = tracker.start(images, starts)
-        return dict(zip(tracked, states, strict=True))
+        return dict(zip(targets, states, strict=True))
 
     def _prompt(
         self,
@@ -510,9 +512,11 @@ class Attender:
         images = dict(views)
         if self.prompting.highlight:
             for camera, per_target in tracks.items():
-                images[camera] = self._mark(
-                    views[camera], per_target, state.colours, others.get(camera, ())
-                )
+                for mask, colour in zip(own_masks(per_target), state.colours, strict=True):
+                    if mask is not None:
+                        images[camera] = self.prompting.form(
+                            images[camera], mask, colour, others.get(camera, ())
+                        )
         return Attended(
             images=images,
             text=state.text,
@@ -522,19 +526,6 @@ class Attender:
             events=events,
             associations=state.associations,
         )
-
-    def _mark(
-        self,
-        rgb: Rgb,
-        tracks: Sequence[Track],
-        colours: Sequence[Colour],
-        others: Sequence[Mask],
-    ) -> Rgb:
-        """One view with every tracked target in its colour; no pixel belongs to two of them."""
-        for mask, colour in zip(own_masks(tracks), colours, strict=True):
-            if mask is not None:
-                rgb = self.prompting.form(rgb, mask, colour, others)
-        return rgb
 
 
 def own_masks(tracks: Sequence[Track]) -> list[Mask | None]:
@@ -559,15 +550,6 @@ def are_shown(tracks: Sequence[Track]) -> tuple[bool, ...]:
     return tuple(mask is not None and bool(mask.any()) for mask in own_masks(tracks))
 
 
-def _winner_ids(candidates: Sequence[Candidates], per_target: PerTarget) -> tuple[int | None, ...]:
-    """The tracker's identity of every target in one view."""
-    ids: list[int | None] = []
-    for of_target, grounding in zip(candidates, per_target, strict=True):
-        winner = grounding.winner
-        ids.append(None if winner is None else of_target.ids[winner])
-    return tuple(ids)
-
-
 def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> list[Mask]:
     """The masks of what is followed and is no target, where they are visible."""
     return [
@@ -575,17 +557,6 @@ def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> 
         for identity, mask in enumerate(followed)
         if identity not in ids and mask is not None and mask.any()
     ]
-
-
-def _colours_in_view(
-    colours: Sequence[Colour], shown: Mapping[str, tuple[bool, ...]]
-) -> list[Colour | None]:
-    """The colour of every target that some view shows; None for the others, not rewritten."""
-    named: list[Colour | None] = []
-    for j, colour in enumerate(colours):
-        somewhere = any(per_target[j] for per_target in shown.values())
-        named.append(colour if somewhere else None)
-    return named
 
 
 def _first_tracks(per_target: PerTarget, ids: Sequence[int | None]) -> tuple[Track, ...]:

@@ -62,16 +62,11 @@ def register(
     `reference_box`; where there is none, the whole photo is the crop. Also returns the indices of
     those photos.
     """
-    crops = []
-    whole = []
-    for i, photo in enumerate(photos):
-        box = reference_box(photo, category, detector, threshold=threshold)
-        if box is None:
-            crops.append(photo)
-            whole.append(i)
-        else:
-            crops.append(crop(photo, box))
-    return remember(name, category, crops, encoder), tuple(whole)
+    boxes = [reference_box(photo, category, detector, threshold=threshold) for photo in photos]
+    pairs = zip(photos, boxes, strict=True)
+    crops = [photo if box is None else crop(photo, box) for photo, box in pairs]
+    whole = tuple(i for i, box in enumerate(boxes) if box is None)
+    return remember(name, category, crops, encoder), whole
 
 
 def reference_box(
@@ -110,13 +105,7 @@ def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -
     fault = row_fault(rows, rows)
     if fault:
         raise BadEncoder(describe_fault("remember", encoder, fault))
-    return PersonalObject(
-        name=name,
-        category=plain_category(category),
-        embeddings=rows,
-        crops=tuple(crops),
-        encoder=encoder.name,
-    )
+    return PersonalObject(name, plain_category(category), rows, tuple(crops), encoder.name)
 
 
 def plain_category(category: str) -> str:
@@ -336,11 +325,7 @@ def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, Persona
 
     Raises: BadMemory, as `load` and `object_files`.
     """
-    objects = {}
-    for path in object_files(Path(bank)):
-        obj = load(path, encoder)
-        objects[obj.name] = obj
-    return objects
+    return {obj.name: obj for obj in (load(path, encoder) for path in object_files(Path(bank)))}
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,13 @@
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from vap_core.base.errors import BadCrop, BadEncoder, one_of
 from vap_core.base.types import (
     SAME,
     Ballot,
+    Boxes,
     PersonalObject,
     Rgb,
     best_of_references,
@@ -62,38 +63,39 @@ def compare(
     return similarity(proposals.embeddings, references)
 
 
-def nominate(rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack) -> Proposals:
-    """The candidates for an object among the proposals of a view.
+def nominate(
+    rgb: Rgb, obj: PersonalObject, offered: Proposals, stack: Stack
+) -> tuple[Proposals, Float32[np.ndarray, "n k"]]:
+    """The candidates for an object among the proposals of a view, and their cosines.
 
-    Where the stack has a verifier, crops of unfamiliar views are compared point by point first.
-
+    Where the stack has a verifier, crops of unfamiliar views are compared point by point, too.
     Raises: BadEncoder, as `compare` does.
     """
     cosine = compare(obj, offered, stack)
-    if stack.verifier is None or offered.boxes.familiar:
-        return shortlist(offered, cosine)
-    few = prove(rgb, obj, shortlist(offered, cosine, most=MOST_COMPARED), stack.verifier)
-    return shortlist(few, compare(obj, few, stack))
+    if stack.verifier is not None and not offered.boxes.familiar:
+        kept = shortlist(offered.boxes, cosine, MOST_COMPARED)
+        offered, cosine = prove(rgb, obj, offered.take(kept), stack.verifier), cosine[kept]
+    kept = shortlist(offered.boxes, cosine, MOST_CANDIDATES)
+    return offered.take(kept), cosine[kept]
 
 
 def shortlist(
-    proposals: Proposals, cosine: Float32[np.ndarray, "n k"], most: int = MOST_CANDIDATES
-) -> Proposals:
-    """The proposals that are candidates, given their cosines with an object's references.
+    boxes: Boxes, cosine: Float32[np.ndarray, "n k"], most: int
+) -> Int64[np.ndarray, " m"]:
+    """Which proposals are candidates, given their cosines with an object's references.
 
     Proposals of any object overlap: of those in one place the one of the best mean score is taken,
     and at most `most` places. Proposals of one category are all candidates.
     """
-    boxes = proposals.boxes
     if boxes.prior is None:
-        return proposals
+        return np.arange(len(boxes))
     mean = election_scores(cosine, boxes).astype(np.float64).mean(axis=1)
     cover = box_cover(boxes.xyxy, boxes.xyxy)
     kept: list[int] = []
     for i in np.argsort(-mean, kind="stable").tolist():
         if len(kept) < most and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
             kept.append(i)
-    return proposals.take(np.array(kept, np.int64))
+    return np.array(kept, np.int64)
 
 
 def check_rule(rule: str, what: str) -> None:
@@ -116,13 +118,7 @@ def vote(cosine: Float32[np.ndarray, "n k"], rule: VoteRule = "vote") -> Ballot:
     check_rule(rule, "vote")
     n, k = cosine.shape
     if n == 0:
-        return Ballot(
-            votes=np.zeros(0, np.int64),
-            tied=np.zeros(0, bool),
-            winner=None,
-            margin=0.0,
-            cosine_margin=0.0,
-        )
+        return Ballot(np.zeros(0, np.int64), np.zeros(0, bool), None, 0.0, 0.0)
     if k == 0:
         raise ValueError("vote: no references; a personal object has at least one")
     votes = np.bincount(best_of_references(cosine), minlength=n).astype(np.int64)

@@ -251,12 +251,12 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     """Parts of the prompted control loop, its recording and a query, beside a backbone pass."""
     import numpy as np
 
-    from vap_core.perception.embedded.backbone import features
     from vap_core.recording import DeferredRecorder
     from vap_core.rollout.loop import rollout
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.study import diagnosis, steps, store
     from vap_core.study.trials import DEMO, make_trial, register_personal
+    from vap_make.perception.backbone import features
 
     register_personal(DEMO, folder / "memory")
     suite, task = DEMO.tasks[-1]

@@ -85,7 +85,14 @@ def belonging(
     if person in OURS:
         return _owned_by(objects, "")
     if person in OTHERS:
-        return _owned_by(objects, _only_other(objects, person, speaker))
+        # The only person besides the speaker who owns one of `objects`.
+        people = sorted({fold(obj.owner) for obj in objects} - {"", fold(speaker)})
+        if len(people) > 1:
+            raise BadInstruction(
+                f"owners: {person!r} could be {' or '.join(people)}; say the name, for example "
+                f'"{people[0]}\'s".'
+            )
+        return _owned_by(objects, people[0]) if people else []
     return _owned_by(objects, find_owner(person, speaker, owners))
 
 
@@ -103,18 +110,18 @@ def find_owner(person: str, speaker: str, owners: dict[str, tuple[str, ...]]) ->
     relation = person.removeprefix("my ")
     speaker = fold(speaker)
     words = [relation]
-    if _relations(person) < 2:
+    # By how many people a person is named: 2 for "my friend's brother", 0 for "anna".
+    first = person.split()[0] in (*MINE, *OURS, *OTHERS)
+    if first + len(re.findall(r"(?:'s|s') ", person)) < 2:
         words.append(relation.split()[-1])
-    if person.startswith("my ") and speaker:
-        mine = [f"{speaker}'s {word}" for word in words]
-    else:
-        mine = []
+    mine = [f"{speaker}'s {word}" for word in words if person.startswith("my ") and speaker]
     for wanted in (mine, [person], words):
-        found = []
-        for name, known_as in owners.items():
-            other = name != speaker or (wanted == [person] and "'s " in person)
-            if other and ({name, *known_as} & set(wanted)):
-                found.append(name)
+        self_too = wanted == [person] and "'s " in person
+        found = [
+            name
+            for name, known_as in owners.items()
+            if (name != speaker or self_too) and ({name, *known_as} & set(wanted))
+        ]
         if len(found) == 1:
             return found[0]
         if found:
@@ -146,28 +153,8 @@ def fold(person: str) -> str:
     return re.sub(r"('s|(?<=s)')$", "", words)
 
 
-def _relations(person: str) -> int:
-    """How many people a person is named by: 2 for "my friend's brother", 0 for "anna"."""
-    first = person.split()[0] in (*MINE, *OURS, *OTHERS)
-    return first + len(re.findall(r"(?:'s|s') ", person))
-
-
 def _owned_by(objects: Sequence[PersonalObject], owner: str) -> list[PersonalObject]:
     return [obj for obj in objects if fold(obj.owner) == owner]
-
-
-def _only_other(objects: Sequence[PersonalObject], word: str, speaker: str) -> str:
-    """The only person besides the speaker who owns one of `objects`; "-" where there is none.
-
-    Raises: BadInstruction.
-    """
-    people = sorted({fold(obj.owner) for obj in objects} - {"", fold(speaker)})
-    if len(people) > 1:
-        raise BadInstruction(
-            f"owners: {word!r} could be {' or '.join(people)}; say the name, for example "
-            f'"{people[0]}\'s".'
-        )
-    return people[0] if people else "-"
 
 
 FILE = "history.jsonl"
@@ -216,10 +203,9 @@ def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
     """Add one use per object; the last MAX_USES uses are kept. Raises: BadOutput."""
     if not objects:
         return
-    added = []
-    for name in objects:
-        row = {"object": name, "by": by, "at": at.isoformat(timespec="seconds")}
-        added.append(json.dumps(row, ensure_ascii=False).encode("utf-8"))
+    about = {"by": by, "at": at.isoformat(timespec="seconds")}
+    rows = [{"object": name, **about} for name in objects]
+    added = [json.dumps(row, ensure_ascii=False).encode("utf-8") for row in rows]
     path = bank / FILE
     with writing(bank, "history", "choose another folder with --memory"):
         bank.mkdir(parents=True, exist_ok=True)
@@ -259,14 +245,8 @@ class Context:
         """
         names = []
         for use in reversed(self.uses):
-            if use.object not in self.objects or (by is not None and fold(use.by) != by):
-                continue
-            if day is not None and self._days_ago(use) != day:
-                continue
-            names.append(use.object)
+            used = datetime.fromisoformat(use.at)
+            days = ((self.now or datetime.now(used.tzinfo)).date() - used.date()).days
+            if use.object in self.objects and by in (None, fold(use.by)) and day in (None, days):
+                names.append(use.object)
         return list(dict.fromkeys(names))
-
-    def _days_ago(self, use: Use) -> int:
-        used = datetime.fromisoformat(use.at)
-        now = self.now or datetime.now(used.tzinfo)
-        return (now.date() - used.date()).days

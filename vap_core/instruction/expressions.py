@@ -125,7 +125,7 @@ def find_expressions(
     before: Expression | None = None
     for match in _beginning(people).finditer(text):
         start = match.start()
-        if _inside(start, exclusions):
+        if any(one.start <= start < one.stop for one in exclusions):
             continue
         person = re.match(rf"(?:{people})\b(?!['’])", text[start:], re.IGNORECASE)
         if person and match.end() <= start + person.end():
@@ -153,7 +153,7 @@ def find_expressions(
         first = None
         if before is not None and kind == "owner" and _continues(text, before, start, stop):
             first = before
-        expression = Expression(
+        before = Expression(
             start=start,
             stop=stop,
             said=text[start:stop],
@@ -162,26 +162,23 @@ def find_expressions(
             destination=placed is not None or (first is not None and first.destination),
             clause=text[start:clause_end],
         )
-        yield expression
-        before = expression
+        yield before
 
 
 def content(said: str, without: Collection[str] = ()) -> str:
     """The words that say which object is meant, in their order."""
-    kept = []
-    for word in re.findall(r"[\w'’-]+", said.lower()):
-        word = re.sub(r"['’]s$", "", word)
-        if word not in GENERIC and word not in without:
-            kept.append(word)
-    return " ".join(kept)
+    words = [re.sub(r"['’]s$", "", word) for word in re.findall(r"[\w'’-]+", said.lower())]
+    return " ".join(word for word in words if word not in GENERIC and word not in without)
 
 
 def find_category(said: str, categories: Collection[str]) -> str | None:
     """The longest category that is named; a plural counts."""
-    for category in sorted(categories, key=len, reverse=True):
-        if re.search(rf"\b{category_pattern(category)}", said, re.IGNORECASE):
-            return category
-    return None
+    named = (
+        category
+        for category in sorted(categories, key=len, reverse=True)
+        if re.search(rf"\b{category_pattern(category)}", said, re.IGNORECASE)
+    )
+    return next(named, None)
 
 
 def person_pattern(context: Context) -> str:
@@ -195,10 +192,6 @@ def person_pattern(context: Context) -> str:
             if "'s " in word:
                 words.append(spaced(word))
     return "|".join(sorted(words, key=len, reverse=True))
-
-
-def _inside(place: int, exclusions: Collection[Exclusion]) -> bool:
-    return any(one.start <= place < one.stop for one in exclusions)
 
 
 @cache
@@ -356,12 +349,12 @@ class Possession:
 
     def elsewhere(self, expression: Expression) -> str | None:
         """The only owner that another expression names: "Ben's cup is there: take that one"."""
-        owners = set()
-        for other in self.expressions:
-            if other.kind in ("owner", "alone") and other is not expression:
-                beginning = self._beginning(other.said)
-                if beginning:
-                    owners.add(fold(beginning))
+        others = [
+            self._beginning(other.said)
+            for other in self.expressions
+            if other.kind in ("owner", "alone") and other is not expression
+        ]
+        owners = {fold(beginning) for beginning in others if beginning}
         return owners.pop() if len(owners) == 1 else None
 
     def _beginning(self, said: str) -> str | None:
@@ -428,23 +421,15 @@ def decompose(text: str) -> tuple[str, ...]:
                 f"decompose: 'it' in {step!r} could be any object of {steps[-1]!r} or before; name "
                 "the object."
             )
-        if steps and not STEP_VERB.match(step):
-            step = _completed(step, steps[-1])
+        verb = STEP_VERB.match(steps[-1]) if steps and not STEP_VERB.match(step) else None
+        if verb is not None:
+            place = None
+            if PLACE.match(steps[-1]) and not STEP_DESTINATION.search(step):
+                place = STEP_DESTINATION.search(steps[-1])
+            step = f"{verb['verb']} {step}{place.group() if place else ''}"
         steps.append(step)
     if not steps:
         raise BadInstruction(
             f'decompose: no command in {text!r}; say one, for example "bring my cup, then my mug".'
         )
     return tuple(steps)
-
-
-def _completed(step: str, before: str) -> str:
-    """A step without a verb, with that of the step before it, and its place where it places."""
-    verb = STEP_VERB.match(before)
-    if verb is None:
-        return step
-    completed = f"{verb['verb']} {step}"
-    if PLACE.match(before) and not STEP_DESTINATION.search(step):
-        place = STEP_DESTINATION.search(before)
-        completed += "" if place is None else place.group()
-    return completed

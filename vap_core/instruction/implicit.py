@@ -55,23 +55,15 @@ def fit(words: str, obj: PersonalObject) -> float:
     """
     if obj.description is None:
         return 0.0
-    there, _, absent = _split_none(words.lower())
-    total = 0.0
-    for part, sign in ((there, 1.0), (absent, -1.0)):
-        total += sign * _fit(part, obj.description.short.lower(), obj.description.long.lower())
-    return total
+    found = NONE.search(words.lower())
+    short, long = obj.description.short.lower(), obj.description.long.lower()
+    total = _fit(wanted(words), short, long)
+    return total - _fit(words.lower()[found.end() :], short, long) if found else total
 
 
 def wanted(words: str) -> str:
     """The words before "without", "no" or "non-": what follows is not there."""
-    return _split_none(words.lower())[0].strip()
-
-
-def _split_none(words: str) -> tuple[str, str, str]:
-    match = NONE.search(words)
-    if match is None:
-        return words, "", ""
-    return words[: match.start()], match.group(), words[match.end() :]
+    return NONE.split(words.lower(), maxsplit=1)[0].strip()
 
 
 def _fit(words: str, short: str, long: str) -> float:
@@ -81,20 +73,15 @@ def _fit(words: str, short: str, long: str) -> float:
     total = 0.0
     said = re.findall(r"\w[\w-]*", words)
     for i, word in enumerate(said):
-        weights = [0.0]
-        for same in (word, *SYNONYMS.get(word, ()), word.rstrip("s")):
-            if same in main:
-                weights.append(MAIN)
-            if same in prominent:
-                weights.append(PROMINENT)
-            if same in minor or f"{same}es" in minor or f"{same}s" in minor:
-                weights.append(MINOR)
-        total += max(weights)
-        if i and weights[1:]:
-            for same in (word, *SYNONYMS.get(word, ())):
-                if f"{said[i - 1]} {same}" in short:
-                    total += PAIR
-                    break
+        same = (word, *SYNONYMS.get(word, ()))
+        alike = {*same, word.rstrip("s")}
+        plural = {*alike, *(f"{each}s" for each in alike), *(f"{each}es" for each in alike)}
+        weight = MINOR * bool(plural & set(minor))
+        weight = PROMINENT if alike & set(prominent) else weight
+        weight = MAIN if alike & set(main) else weight
+        total += weight
+        if i and weight and any(f"{said[i - 1]} {each}" in short for each in same):
+            total += PAIR
     if words.strip() in ("plain", "all black", "plain one"):
         total += float("plain" in minor or " with " not in short)
     return total
@@ -117,22 +104,17 @@ def object_scores(
     (query,) = embed([there or words])
     scores = np.zeros(len(objects), np.float32)
     for i, obj in enumerate(objects):
-        cosines = np.sort(embed(_texts(obj, looks)) @ query)
+        texts = [obj.category]
+        if obj.note:
+            texts += [obj.note, f"{obj.category} {obj.note}", f"something {obj.note}"]
+        if looks and obj.description is not None:
+            texts.append(f"{obj.category}, {obj.description.short}")
+        cosines = np.sort(embed(texts) @ query)
         cosine = cosines[-1] if looks else cosines[-2:].mean()
         if not there:
             cosine = 0.0
         scores[i] = float(cosine) + LOOKS * fit(words, obj)
     return scores
-
-
-def _texts(obj: PersonalObject, looks: bool) -> list[str]:
-    """What is known of an object, in phrases."""
-    texts = [obj.category]
-    if obj.note:
-        texts += [obj.note, f"{obj.category} {obj.note}", f"something {obj.note}"]
-    if looks and obj.description is not None:
-        texts.append(f"{obj.category}, {obj.description.short}")
-    return texts
 
 
 PURPOSE = 0.3
@@ -187,16 +169,16 @@ class Reading:
         owner = self._possession.owner(expression, said)
         if expression.kind == "indefinite" and owner is None:
             return None
-        earlier = self._is_earlier(said)
+        rest = _without(expression.clause, self.exclusions, expression.start)
+        again = expression.argument and re.search(r"\b(?:again|once more)\b", rest) is not None
+        earlier = again or EARLIER.search(said) is not None
         if expression.destination and owner is None and not earlier:
             return None
         every = list(context.objects.values())
         category = self._category(said, owner is not None)
         if owner is None and category is not None and find_category(said, [category]) is None:
             owner = self._possession.elsewhere(expression)
-        candidates = every
-        if category is not None:
-            candidates = [obj for obj in every if obj.category == category]
+        candidates = [obj for obj in every if category in (None, obj.category)]
         if earlier and category is None and owner is not None and fold(owner) not in MINE:
             return self._used(said, every, owner)
         if owner is not None:
@@ -234,12 +216,6 @@ class Reading:
         raise BadInstruction(
             f"parse: 'it' in {self.text[:60]!r} could be any of {names[:150]}; name the object."
         )
-
-    def _is_earlier(self, said: str) -> bool:
-        rest = _without(self.expression.clause, self.exclusions, self.expression.start)
-        if EARLIER.search(said):
-            return True
-        return self.expression.argument and re.search(r"\b(?:again|once more)\b", rest) is not None
 
     def _categories(self) -> list[str]:
         return sorted({obj.category for obj in self.context.objects.values()})
@@ -293,19 +269,17 @@ class Reading:
         match = re.search(rf"\b({person}|he|she|they)\s+(?!own)[\w-]+", said, re.IGNORECASE)
         if match and fold(match.group(1)) not in MINE:
             owner = self._possession.antecedent(self.expression, match.group(1))
-            if fold(owner) in OTHERS:
-                by = None
-            else:
-                by = find_owner(owner, context.speaker, context.owners)
+            known = fold(owner) not in OTHERS
+            by = find_owner(owner, context.speaker, context.owners) if known else None
         day = None
         if re.search(r"\byesterday\b", said, re.IGNORECASE):
             day = 1
         elif re.search(r"\b(?:today|this (?:morning|afternoon|evening)|tonight)\b", said, re.I):
             day = 0
+        named = {obj.name: obj for obj in candidates}
         for name in context.latest(by, day):
-            for obj in candidates:
-                if obj.name == name:
-                    return obj
+            if name in named:
+                return named[name]
         who = f" by {by}" if by else ""
         raise UnknownName(
             f"parse: no earlier use{who} of what {self.expression.said[:60]!r} means is "
@@ -319,7 +293,10 @@ class Reading:
         if owner is None and not LOOSE.search(self.expression.said):
             return None
         if not words and (self.expression.argument or owner is not None):
-            words = content(self._rest(), self._known_words(None))
+            # The text beside the expression and its verb.
+            before = self.text[: self.expression.start].rstrip()
+            rest = re.sub(r"[\w-]+(?: me| up)?$", "", before) + self.text[self.expression.stop :]
+            words = content(rest, self._known_words(None))
         if not words or not candidates:
             return None
         scores = self._scores(words, candidates)
@@ -337,11 +314,6 @@ class Reading:
         if len(order) > 1 and scores[order[0]] - scores[order[1]] < MARGIN:
             raise _ambiguous(self.expression, [candidates[i] for i in order[:2]])
         return candidates[order[0]]
-
-    def _rest(self) -> str:
-        """The text beside the expression and its verb."""
-        before = self.text[: self.expression.start].rstrip()
-        return re.sub(r"[\w-]+(?: me| up)?$", "", before) + self.text[self.expression.stop :]
 
     def _only(
         self, candidates: list[PersonalObject], words: str, owner: str | None, category: str
@@ -436,6 +408,7 @@ class EmbeddingParser:
         problem: VapError | None = None
         unmet: VapError | None = None
         people = person_pattern(self.context)
+        known = {obj.category for obj in self.context.objects.values()}
         expressions = list(find_expressions(text, exclusions, people))
         last = 0
         for expression in expressions:
@@ -443,17 +416,15 @@ class EmbeddingParser:
                 continue
             try:
                 obj = Reading(
-                    context=self.context,
-                    embed=self.embed,
-                    text=text,
-                    expression=expression,
-                    expressions=expressions,
-                    exclusions=exclusions,
+                    self.context, self.embed, text, expression, expressions, exclusions
                 ).object()
             except VapError as error:
                 if problem is None or expression.governed:
                     problem = error
-                if expression.kind == "owner" and self._is_wanted(expression):
+                # Without such an object the instruction cannot be followed.
+                named = find_category(expression.said, known) is not None
+                wanted = expression.argument or (expression.destination and named)
+                if expression.kind == "owner" and wanted:
                     unmet = unmet or error
                 continue
             if obj is not None:
@@ -467,12 +438,6 @@ class EmbeddingParser:
             "it is for."
         )
         raise unmet or problem or nothing
-
-    def _is_wanted(self, expression: Expression) -> bool:
-        """Whether the instruction cannot be followed without the object."""
-        known = {obj.category for obj in self.context.objects.values()}
-        named = find_category(expression.said, known) is not None
-        return expression.argument or (expression.destination and named)
 
 
 def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target, ...]:
@@ -495,10 +460,4 @@ def _targets(found: Sequence[tuple[Expression, PersonalObject]]) -> tuple[Target
 
 
 def _target(expression: Expression, obj: PersonalObject) -> Target:
-    return Target(
-        start=expression.start,
-        stop=expression.stop,
-        owner=obj.owner,
-        category=obj.category,
-        object=obj.name,
-    )
+    return Target(expression.start, expression.stop, obj.owner, obj.category, object=obj.name)

@@ -49,7 +49,7 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
         endpoint = endpoint_from_environment("" if name == "chat" else name)
         parser = ChatParser(context, endpoint)
         if fall_back:
-            return FallBack(parser, rule_parser(context.objects), _print_error)
+            return FallBack(parser, rule_parser(context.objects), partial(print, file=sys.stderr))
         return parser
     raise UnknownName(
         f"parser: {name!r} is unknown; known: {', '.join(NAMES)}, or the address of a chat "
@@ -101,10 +101,6 @@ class FallBack:
         except BadEndpoint as error:
             self.report(f"note: {error} The rule parses instead.")
             return self.second(text, categories)
-
-
-def _print_error(line: str) -> None:
-    print(line, file=sys.stderr)
 
 
 TASK = (
@@ -212,15 +208,7 @@ class ChatParser:
                 place = next(places[said], None)
                 if place is None or not said.strip():
                     raise ValueError("no part of the instruction")
-                targets.append(
-                    Target(
-                        start=place.start(),
-                        stop=place.end(),
-                        owner=obj.owner,
-                        category=obj.category,
-                        object=obj.name,
-                    )
-                )
+                targets.append(Target(*place.span(), obj.owner, obj.category, object=obj.name))
             targets.sort(key=lambda target: target.start)
             for one, other in pairwise(targets):
                 if other.start < one.stop:

@@ -127,7 +127,11 @@ def rewrite(instruction: Instruction, colours: Sequence[Colour | None]) -> str:
     text = instruction.text
     for start in sorted(spans, reverse=True):
         span, colour = spans[start]
-        article = "The" if _has_capital(instruction.text, span) else "the"
+        # A capital begins a sentence; within one it is a name's or a style of writing ("Bring
+        # Anna's cup", "Bring My Cup").
+        before = instruction.text[:start].rstrip()
+        capital = instruction.text[start].isupper() and (not before or before[-1] in ".!?")
+        article = "The" if capital else "the"
         text = text[:start] + f"{article} {colour.name} {span.category}" + text[span.stop :]
     return text
 
@@ -155,15 +159,6 @@ def is_name(said: str, category: str) -> bool:
     owner = rf"(?:my|his|her|their|our)\s|(?:{ARTICLE})?(?:[\w-]+\s+){{0,2}}[\w-]+['’]"
     named = re.match(rf"(?:{owner}).*?\b{category_pattern(category)}", said, re.IGNORECASE)
     return named is not None
-
-
-def _has_capital(text: str, target: Target) -> bool:
-    """Whether a span begins a sentence with a capital letter; within one it is a name's or a style
-    of writing ("Bring Anna's cup", "Bring My Cup")."""
-    before = text[: target.start].rstrip()
-    if before and before[-1] not in ".!?":
-        return False
-    return text[target.start].isupper()
 
 
 def category_pattern(category: str) -> str:

@@ -213,7 +213,7 @@ def measure_openings(rows: Sequence[EpisodeRow], stack: Stack) -> tuple[list[Row
     tiles = [_square(personal.crops[0])]
     for episode in opening_views(rows):
         for view, offered in zip(episode, find_candidates(episode, stack), strict=True):
-            few = nominate(view.rgb, personal, offered, stack)
+            few, _ = nominate(view.rgb, personal, offered, stack)
             candidates = segment(view.rgb, few, stack)
             grounding = attender.reject(attender.ground(view.camera, personal, candidates))
             row = _view_row(view, offered, grounding)

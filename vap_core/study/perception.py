@@ -373,7 +373,7 @@ def _choices(
     target_ious: dict[tuple[float, ...], float] = {}
     rows = []
     for k, personal in memory.items():
-        few = nominate(view.rgb, personal, candidates, stack)
+        few, _ = nominate(view.rgb, personal, candidates, stack)
         cosine = compare(personal, few, stack)
         like = likeness(cosine, few.boxes)
         true_cosine = similarity(true_embeddings, personal.embeddings)
@@ -523,7 +523,7 @@ def agreements(
     """
     few = []
     for view, of_view in zip(episode, candidates, strict=True):
-        few.append(nominate(view.rgb, personal, of_view, stack))
+        few.append(nominate(view.rgb, personal, of_view, stack)[0])
     sightings = _sightings(episode, few, personal, stack)
     single = {camera: vote(sighting.cosine).winner for camera, sighting in sightings.items()}
     pairings: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from vap_core.base.errors import one_of, require
+from vap_core.base.errors import one_of
 from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.simulation import suites
 from vap_core.simulation.types import EpisodeRow
@@ -116,9 +116,8 @@ class Survey(Measurement):
     def jobs(self) -> list[Job]:
         """Every job, the long ones first, so that processes finish together.
 
-        Raises: BadSuite for a damaged list; MissingPart: the unit of speed needs torch.
+        Raises: BadSuite for a damaged list.
         """
-        require("foundation", "the unit of speed, a pass of the backbone by torch,")
         jobs = []
         tracked = tracking.plan({name: self.n_tracked(name) for name in self.suites}, self.suites)
         if self.quick:

@@ -25,7 +25,6 @@ from jaxtyping import Bool, Float64
 from vap_core.attend import Attender
 from vap_core.base.types import Boxes, Mask, Rgb, Track, value
 from vap_core.perception.boxes import mask_box, mask_iou
-from vap_core.perception.embedded.backbone import features
 from vap_core.perception.protocols import Stack, TargetTracker
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.scripted.expert import Expert
@@ -407,7 +406,7 @@ TASK = "pick-shaver"
 Work = Callable[[], object]
 START = "start-up grounding"
 STEP = "track step"
-PASS = "backbone pass"
+PASS = "encoder pass"
 POLICY = "scripted policy's plan"
 LIMITS_MS = {START: 300.0, STEP: 45.0}
 
@@ -479,7 +478,7 @@ def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
     return {
         START: lambda: attender.start(views, row.instruction),
         STEP: track_step,
-        PASS: lambda: features([views[camera]], ["head"]),
+        PASS: lambda: stack.encoder([views[camera]]),
         POLICY: plan,
     }
 

@@ -17,7 +17,7 @@ from vap_core.simulation.assets.phrases import AMBIGUOUS
 from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study.perception import View, object_under_box, opening_views, registered_object
-from vap_core.vote import compare, nominate, vote
+from vap_core.vote import nominate, vote
 from vap_make.films.demonstrations import draw_objects, row
 from vap_make.objects import generic_instance
 from vap_make.recipe import filmed_tasks
@@ -110,8 +110,7 @@ def _views_of(case: Case, views: Sequence[View]) -> list[View]:
 
 def _elect(obj: PersonalObject, offered: Proposals, view: View, stack: Stack) -> Row:
     """What the vote elects in one view."""
-    few = nominate(view.rgb, obj, offered, stack)
-    cosine = compare(obj, few, stack)
+    few, cosine = nominate(view.rgb, obj, offered, stack)
     winner = vote(election_scores(cosine, few.boxes)).winner
     answer: Row = {"familiar": few.boxes.familiar, "likeness": None, "right": False}
     if winner is not None:

@@ -15,13 +15,13 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.files import replacing, writing
 from vap_core.base.types import Rgb
-from vap_core.perception.embedded.backbone import features
 from vap_core.perception.embedded.networks import CHANNELS
 from vap_core.perception.embedded.networks import STRIDE as STRIDES
 from vap_core.perception.embedded.proposer import SIDE, STRIDE, TAPS, resize_for_search
 from vap_core.perception.text_encoder import embed_text
 from vap_core.simulation.assets.phrases import AMBIGUOUS
 from vap_make.films.scenes import POSES, Shots, boxes_of
+from vap_make.perception.backbone import features
 from vap_make.perception.fitting import Run, fit, half_precision
 from vap_make.perception.graphs import DetectHead
 from vap_make.perception.phrases import NEGATIVES, training_phrases

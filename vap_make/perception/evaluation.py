@@ -12,7 +12,6 @@ from tqdm import tqdm
 from vap_core.base.types import value
 from vap_core.perception.boxes import box_iou, crop, mask_iou
 from vap_core.perception.embedded.encoder import LiteEncoder
-from vap_core.perception.embedded.networks import TorchNetwork
 from vap_core.perception.embedded.proposer import THRESHOLD, LiteDetector, decode, resize_for_search
 from vap_core.perception.embedded.segmenter import LiteSegmenter
 from vap_core.simulation.assets import objects
@@ -21,6 +20,7 @@ from vap_core.study.perception import FLOOR, VISIBLE_PX, match
 from vap_core.study.stats import average_precision, rate
 from vap_core.vote import similarity, vote
 from vap_make.films.scenes import POSES, Shots, boxes_of
+from vap_make.perception.backbone import TorchNetwork
 from vap_make.perception.graphs import (
     DetectHead,
     DetectNetwork,

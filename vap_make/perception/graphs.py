@@ -16,20 +16,19 @@ from torch.nn import functional as F  # noqa: N812
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import value
 from vap_core.perception.embedded import encoder, proposer, segmenter
-from vap_core.perception.embedded.backbone import Trunk, normalise
 from vap_core.perception.embedded.encoder import HISTOGRAM_LENGTH, INSTANCE_TAPS, INSTANCE_WIDTH
 from vap_core.perception.embedded.networks import (
     CHANNELS,
     PERCEPTION,
     WEIGHTS_KEY,
     read_checked,
-    write_entry,
 )
 from vap_core.perception.embedded.proposer import TAPS
 from vap_core.perception.embedded.segmenter import MASK_TAPS
 from vap_core.perception.embedded.tracker import cells
 from vap_core.perception.embedded.tracker.cells import TAP
 from vap_core.perception.text_encoder import WIDTH as TEXT_WIDTH
+from vap_make.perception.backbone import Trunk, normalise, write_entry
 
 COARSE_WIDTH = 96
 FINE_WIDTH = 64

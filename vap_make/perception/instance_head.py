@@ -15,7 +15,6 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.types import Rgb, value
 from vap_core.perception.boxes import crop
-from vap_core.perception.embedded.backbone import features, normalise
 from vap_core.perception.embedded.encoder import (
     HISTOGRAM_LENGTH,
     INSTANCE_SIDE,
@@ -26,6 +25,7 @@ from vap_core.perception.embedded.encoder import (
 )
 from vap_core.perception.embedded.networks import CHANNELS
 from vap_make.films.scenes import POSES, Shots, boxes_of
+from vap_make.perception.backbone import features, normalise
 from vap_make.perception.detector import augment, save_array
 from vap_make.perception.fitting import Run, fit, half_precision
 from vap_make.perception.graphs import InstanceHead, halve_b4

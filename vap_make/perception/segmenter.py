@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from vap_core.perception.boxes import mask_box
-from vap_core.perception.embedded.backbone import load_backbone, normalise
 from vap_core.perception.embedded.segmenter import MASK_TAPS, SIDE, box_plane, cut, window_around
 from vap_make.films.scenes import Shots, boxes_of
+from vap_make.perception.backbone import load_backbone, normalise
 from vap_make.perception.detector import augment
 from vap_make.perception.fitting import Run, fit, half_precision
 from vap_make.perception.graphs import MaskHead

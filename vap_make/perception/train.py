@@ -20,11 +20,12 @@ from torch import nn
 from tqdm import tqdm
 
 from vap_core.base.files import kept_folder, make_folder, writing
-from vap_core.perception.embedded.networks import PERCEPTION, save_weights
+from vap_core.perception.embedded.networks import PERCEPTION
 from vap_core.simulation.assets import objects
 from vap_core.study.workers import results
 from vap_make.films.scenes import VIEWS, Shots, cached, only_generic, stage_file
 from vap_make.perception import detector, instance_head, segmenter
+from vap_make.perception.backbone import save_weights
 from vap_make.perception.fitting import Run
 from vap_make.perception.graphs import export_graphs, require_onnx
 

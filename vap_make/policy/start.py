@@ -9,7 +9,7 @@ learned words are taught, its words' embeddings have to be that model's still.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from safetensors.torch import load_file
@@ -29,6 +29,8 @@ ALIKE = 0.99
 
 A policy that moved its words has 0.78 to 0.89, one that kept them 1.000.
 """
+
+SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 
 
 @dataclass(frozen=True)
@@ -107,3 +109,18 @@ def require_alike(start: Start, wanted: MiniPI0Config) -> None:
                 f"train policy: {start.folder} differs from the recipe in {name}; go on from a "
                 "policy of the same suite, or leave out --start."
             )
+
+
+def initialise_policy(vlm: MiniVlm, policy: Any) -> None:
+    """Start a policy's image tower, decoder and words from the model's.
+
+    Raises: BadPolicy when words or sizes differ.
+    """
+    for name in ("words", *SIZES):
+        if getattr(policy.config, name) != getattr(vlm.config, name):
+            raise BadPolicy(
+                f"vlm.initialise_policy: policy and mini-PaliGemma differ in {name}; make the "
+                "model again: python -m vap_core train vlm"
+            )
+    paligemma = policy.model.paligemma_with_expert.paligemma
+    paligemma.load_state_dict(vlm.towers.paligemma.state_dict())

