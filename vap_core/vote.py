@@ -69,14 +69,19 @@ def nominate(
     """The candidates for an object among the proposals of a view, and their cosines.
 
     Where the stack has a verifier, crops of unfamiliar views are compared point by point, too.
+
     Raises: BadEncoder, as `compare` does.
     """
     cosine = compare(obj, offered, stack)
+    references = reference_rows(obj, stack.encoder_of(offered.boxes))
+    few = offered
     if stack.verifier is not None and not offered.boxes.familiar:
-        kept = shortlist(offered.boxes, cosine, MOST_COMPARED)
-        offered, cosine = prove(rgb, obj, offered.take(kept), stack.verifier), cosine[kept]
-    kept = shortlist(offered.boxes, cosine, MOST_CANDIDATES)
-    return offered.take(kept), cosine[kept]
+        likely = offered.take(shortlist(offered.boxes, cosine, MOST_COMPARED))
+        few = prove(rgb, obj, likely, stack.verifier)
+        cosine = similarity(few.embeddings, references)
+    few = few.take(shortlist(few.boxes, cosine, MOST_CANDIDATES))
+    # Not rows of `cosine`: a product of fewer rows may round its last bit otherwise.
+    return few, similarity(few.embeddings, references)
 
 
 def shortlist(
