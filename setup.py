@@ -16,7 +16,6 @@ SHIPPED = (
     "paraphrases",
     "photo-set",
     "policies",
-    "results/readings.csv",
     "suites",
     "weights",
 )

@@ -24,7 +24,6 @@ SHIPPED = (
     "paraphrases",
     "photo-set",
     "policies",
-    "results/readings.csv",
     "suites",
     "weights",
 )

@@ -14,19 +14,18 @@ import numpy as np
 from jaxtyping import Float
 
 from vap_core.base.errors import BadStudy
-from vap_core.base.files import align
-from vap_core.base.pictures import FRAME, OTHER, TEXT, WINNER, empty_figure
 from vap_core.policies.protocol import ACTION
 from vap_core.simulation.suites import BENCHMARKS
+from vap_core.study import charts
 from vap_core.study.attention import BACKGROUND, LOOKALIKES, REGIONS, TARGET, WORDS
 from vap_core.study.attention import name_of as name_of
 from vap_core.study.attention import read as read
 from vap_core.study.stats import NONE, SEED, Estimate, share
 from vap_core.study.store import KEY
+from vap_core.study.table import printed
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MEASURES = (
@@ -48,13 +47,6 @@ PATTERNS = {
 }
 """The paper's patterns: the localisation, and the success where the pattern says it."""
 ALL_SUITES = "all suites"
-QUERY_COLOURS = {
-    "token": "#009e73",
-    "colour": "#c0392b",
-    "category": "#7f5af0",
-    "action": "#3b3b3b",
-}
-SUCCESS, FAILURE = TEXT, FRAME
 CALLS_BEFORE, LEAST_EPISODES = 8, 4
 """Calls before the first touch that are shown, and episodes behind a point."""
 
@@ -228,9 +220,6 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     Where no call came before the first touch, it says so.
     """
 
-    def lines(table: "pd.DataFrame") -> str:
-        return align([list(map(str, table.columns)), *table.astype(str).to_numpy().tolist()])
-
     calls, episodes = tables["calls"], tables["episodes"]
     table = per_episode(calls, episodes)
     whole = per_episode(calls, episodes, whole=True)
@@ -238,10 +227,10 @@ def text(tables: "dict[str, pd.DataFrame]") -> str:
     parts = [f"{len(episodes)} episodes run again, {again} of them end as in the run"]
     if len(table):
         parts[0] += "; before the first touch:"
-        parts.append(lines(where_text(where_queries_look(table))))
+        parts.append(printed(where_text(where_queries_look(table))))
     if len(whole):
         parts.append("the word that means the target, over whole episodes:")
-        parts.append(lines(pattern_counts(with_localisation(whole))))
+        parts.append(printed(pattern_counts(with_localisation(whole))))
     if not len(table):
         parts.append("no call came before the first touch")
     return "\n\n".join(parts)
@@ -396,111 +385,53 @@ def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
 def where_figure(table: "pd.DataFrame") -> "Figure":
     """Density of attention on the target and on its look-alikes, by suite, method and query.
 
-    `table` is `where_queries_look`'s; 1 is what an even attention would have, bars of error are
-    95 % intervals over layouts.
+    `table` is `where_queries_look`'s; 1 is what an even attention would have, intervals are over
+    layouts.
     """
-    lines = in_order(table).iloc[::-1].reset_index(drop=True)
-    figure = empty_figure(7.2, 0.3 * len(lines) + 1.1)
-    axes = figure.subplots()
-    places = np.arange(len(lines))
-    for name, label, colour, offset in (
-        ("lift", "target", WINNER, 0.19),
-        ("lift_lookalikes", "look-alikes", OTHER, -0.19),
-    ):
-        value = lines[name].to_numpy(float)
-        error = [value - lines[f"{name}_low"], lines[f"{name}_high"] - value]
-        axes.barh(places + offset, value, 0.36, color=colour, label=label)
-        axes.errorbar(
-            value, places + offset, xerr=error, fmt="none", ecolor="black", elinewidth=0.7
-        )
-    axes.axvline(1, color="black", linewidth=0.8, linestyle=":", label="even attention")
-    names = [
-        f"{line.suite} · {line.method} · {line.query} (n = {line.n})" for line in lines.itertuples()
-    ]
-    axes.set_yticks(places, names, fontsize=8)
-    axes.set_ylim(-0.6, len(lines) - 0.4)
-    axes.set_xlabel("attention per area before the first touch, whole view = 1")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8)
-    return figure
+    import pandas as pd
+
+    lines = in_order(table)
+    lines = lines.assign(
+        line=lines["method"] + " · " + lines["query"] + ", n " + lines["n"].map(str)
+    )
+    marks = []
+    for name, region in (("lift", "target"), ("lift_lookalikes", "look-alikes")):
+        of_region = lines[["suite", "line"]].assign(value=lines[name], region=region)
+        marks.append(of_region.assign(low=lines[f"{name}_low"], high=lines[f"{name}_high"]))
+    shown = pd.concat(marks)
+    label = "attention per area before the first touch, whole view = 1 [95 %]"
+    most = 1.05 * float(shown["high"].max())
+    look = dict(group="suite", series="region", label=label, scale=1.0, limits=(0.0, most))
+    return charts.dots(shown, "line", **look)
 
 
 def layers_figure(table: "pd.DataFrame") -> "Figure":
-    """Density on the target by layer; `table` is `layer_table`'s.
+    """Density on the target by layer, a panel per suite and method; `table` is `layer_table`'s.
 
-    A column of panels a suite, a row a method. Words of the last layer have no effect on the
-    actions: their points are hollow.
+    Words of the last layer have no effect on the actions.
     """
-    figure, grid = _grid(table, width=2.6, height=2.3)
-    legend: dict[str, Any] = {}
-    for (suite, method), axes in grid.items():
-        panel = table[(table["suite"] == suite) & (table["method"] == method)]
-        for query, lines in panel.groupby("query", observed=True, sort=False):
-            ordered = lines.sort_values("layer")
-            colour = QUERY_COLOURS[str(query)]
-            layers, lift = ordered["layer"].to_numpy() + 1, ordered["lift"].to_numpy()
-            axes.plot(layers, lift, color=colour, label=str(query), linewidth=1.5)
-            last = (layers == layers.max()) & (query != "action")
-            axes.scatter(layers[~last], lift[~last], color=colour, s=22, zorder=3)
-            axes.scatter(
-                layers[last], lift[last], facecolor="white", edgecolor=colour, s=26, zorder=3
-            )
-        axes.axhline(1, color="black", linewidth=0.8, linestyle=":", label="even attention")
-        axes.set_title(f"{suite}, {method}", fontsize=9)
-        axes.set_xlabel("layer")
-        axes.set_xticks(sorted(set(panel["layer"] + 1)))
-        handles, labels = axes.get_legend_handles_labels()
-        legend |= dict(zip(labels, handles, strict=True))
-    figure.supylabel("attention per area on the target", fontsize=9)
-    figure.legend(
-        legend.values(), legend.keys(), loc="outside lower center", ncols=5, frameon=False
+    shown = table.assign(
+        panel=table["suite"].astype(str) + ", " + table["method"].astype(str),
+        layer=table["layer"] + 1,
+        value=table["lift"],
     )
-    return figure
+    label = "attention per area on the target"
+    look = dict(panel="panel", series="query", label=label, scale=1.0, top=None)
+    return charts.curves(shown, "layer", label_x="layer", **look)
 
 
 def patterns_figure(counts: "pd.DataFrame") -> "Figure":
-    """Episodes of every localisation, successes and failures; `counts` is `pattern_counts`'.
+    """Episodes of every localisation, successes and failures; `counts` is `pattern_counts`'."""
+    import pandas as pd
 
-    A column of panels a suite, a row a method.
-    """
-    figure, grid = _grid(counts, width=2.7, height=2.2)
-    places = np.arange(len(LOCALISATIONS))
+    lines = []
     for line in counts.to_dict("records"):
-        axes = grid[line["suite"], line["method"]]
-        wins = np.array([line[f"{name}, success"] for name in LOCALISATIONS])
-        total = np.array([line[name] for name in LOCALISATIONS])
-        share_won, lost = 100 * wins / line["n"], 100 * (total - wins) / line["n"]
-        axes.bar(places, share_won, 0.7, color=SUCCESS, label="success")
-        axes.bar(places, lost, 0.7, share_won, color=FAILURE, label="failure")
-        for place, won, of in zip(places, wins, total, strict=True):
-            height = 100 * of / line["n"] + 1
-            axes.text(float(place), height, f"{won}/{of}", ha="center", fontsize=7)
-        axes.set_xticks(places, LOCALISATIONS, fontsize=7)
-        axes.set_ylim(0, 108)
-        axes.set_title(f"{line['suite']}, {line['method']} (n = {line['n']})", fontsize=8)
-    figure.supylabel("% of episodes", fontsize=9)
-    handles = next(iter(grid.values())).get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    return figure
-
-
-def _grid(
-    table: "pd.DataFrame", *, width: float, height: float
-) -> "tuple[Figure, dict[tuple[str, str], Axes]]":
-    """A panel for every suite and method of a table, suites from left to right."""
-    pairs = list(zip(in_order(table)["suite"].astype(str), in_order(table)["method"], strict=True))
-    suites = list(dict.fromkeys(suite for suite, _ in pairs))
-    methods = list(dict.fromkeys(table["method"].astype(str)))
-    figure = empty_figure(max(4.0, width * len(suites) + 0.4), height * len(methods) + 0.5)
-    panels = figure.subplots(len(methods), len(suites), squeeze=False, sharey=True)
-    grid = {}
-    for (row, column), axes in np.ndenumerate(panels):
-        axes.spines[["top", "right"]].set_visible(False)
-        if (suites[column], methods[row]) in pairs:
-            grid[suites[column], methods[row]] = axes
-        else:
-            axes.set_axis_off()
-    return figure, grid
+        for name in LOCALISATIONS:
+            won = line[f"{name}, success"]
+            about = {"of": f"{line['suite']}, {line['method']}", "localisation": name}
+            lines.append({**about, "n": line["n"], "success": won, "failure": line[name] - won})
+    look = dict(group="of", label="% of episodes (in the bars: how many)")
+    return charts.stacked(pd.DataFrame(lines), "localisation", ["success", "failure"], **look)
 
 
 def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
@@ -509,29 +440,19 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     Episodes that succeed and that fail apart, without those that touch nothing; `calls` are of one
     query a method.
     """
+    import pandas as pd
+
     merged = over_views(calls).merge(episodes, on=KEY)
     touched = merged[merged["first_touch"].notna() & (merged["step"] < merged["first_touch"])]
     keys = [touched[name] for name in KEY]
-    left = touched.groupby(keys, observed=True)["step"].rank(ascending=False) - 1
-    shown = touched.assign(left=left)[left <= CALLS_BEFORE]
-    methods = list(dict.fromkeys(shown["method"].astype(str)))
-    figure = empty_figure(3.6 * len(methods), 3.1)
-    row = figure.subplots(1, len(methods), squeeze=False, sharey=True)[0]
-    for axes, method in zip(row, methods, strict=True):
-        of_method = shown[shown["method"].astype(str) == method]
-        for name, colour, line in (("success", SUCCESS, "o-"), ("failure", FAILURE, "s--")):
-            ended = of_method[of_method["success"] == (name == "success")]
-            group = ended.groupby("left")
-            rates = 100 * group["hit"].mean()[group.size() >= LEAST_EPISODES]
-            same = (episodes["method"] == method) & (episodes["success"] == (name == "success"))
-            label = f"{name} ({len(ended[KEY].drop_duplicates())} of {same.sum()})"
-            axes.plot(-rates.index, rates, line, markersize=4, color=colour, label=label)
-        chance = 100 * of_method["chance_hit"].mean()
-        axes.axhline(chance, color="black", linewidth=0.8, linestyle=":", label="chance")
-        axes.set_title(method, fontsize=9)
-        axes.set_xlabel("calls before the first touch")
-        axes.spines[["top", "right"]].set_visible(False)
-        below = (0.5, -0.24)
-        axes.legend(loc="upper center", bbox_to_anchor=below, ncols=2, frameon=False, fontsize=7)
-    row[0].set_ylabel("peak on the target, %")
-    return figure
+    left = 1 - touched.groupby(keys, observed=True)["step"].rank(ascending=False)
+    shown = touched.assign(left=left)[left >= -CALLS_BEFORE]
+    shown["ends"] = shown["success"].map({True: "success", False: "failure"})
+    groups = shown.groupby(["method", "ends", "left"], observed=True)["hit"]
+    rates = groups.mean()[groups.size() >= LEAST_EPISODES].rename("value").reset_index()
+    chance = shown.groupby("method", observed=True)["chance_hit"].mean()
+    even = rates.drop_duplicates(["method", "left"])
+    even = even.assign(ends="chance", value=even["method"].map(chance).astype(float))
+    lines = pd.concat([rates, even.sort_values("left")])
+    look = dict(panel="method", series="ends", label="peak on the target, %", dashed=["chance"])
+    return charts.curves(lines, "left", label_x="calls before the first touch", **look)

@@ -116,9 +116,10 @@ def dots(
     label: str = "% of episodes that succeed, 95 % interval",
     title: str = "",
     limits: tuple[float, float] = (-3.0, 108.0),
+    scale: float = 100.0,
 ) -> "Figure":
-    """A line per name in the column `line`, below the bold heading of its `group`: the value in %
-    with its interval; the paper's is a diamond.
+    """A line per name in the column `line`, below the bold heading of its `group`: the value by
+    `scale` with its interval; the paper's is a diamond.
 
     A mark per `series` has its own colour and marker, and per `policy` of a series another marker.
     """
@@ -155,9 +156,9 @@ def dots(
             filled = row.get("filled", number % 2 == 0)
             several = policy and len(policies) > 1
             axes.errorbar(
-                100 * row["value"],
+                scale * row["value"],
                 y,
-                xerr=_ends([row]),
+                xerr=_ends([row], scale),
                 fmt=marker,
                 color=colour,
                 markerfacecolor=colour if filled else "white",
@@ -168,13 +169,18 @@ def dots(
             )
             if most == 1 and limits[0] > -10:
                 end = np.nanmax([row["high"], row["value"]])
-                axes.text(100 * end + 2, y, f"{100 * row['value']:.0f}", va="center", fontsize=8)
+                axes.text(
+                    scale * end + 2, y, f"{scale * row['value']:.0f}", va="center", fontsize=8
+                )
             if row.get("paper", np.nan) == row.get("paper", np.nan):
                 look = dict(color=PAPER, fillstyle="none", markersize=5, label="the paper's")
-                axes.plot(100 * row["paper"], y, "D", **look)
-        axes.set_yticks(range(len(labels)), labels, fontsize=8)
+                axes.plot(scale * row["paper"], y, "D", **look)
+        shown = ["" if i in bold else name for i, name in enumerate(labels)]
+        axes.set_yticks(range(len(labels)), shown, fontsize=8)
         for i in bold:
-            axes.get_yticklabels()[i].set_fontweight("bold")
+            look = dict(va="center", fontsize=8, fontweight="bold")
+            place = limits[0] + 0.01 * (limits[1] - limits[0])
+            axes.text(place, i, labels[i], in_layout=False, **look)
         if limits[0] <= -10:
             axes.axvline(0, color=TEXT, linewidth=0.8)
         axes.set(xlim=limits, ylim=(len(labels) - 0.4, -0.6))
@@ -186,9 +192,11 @@ def dots(
     shared = len(panels) > 1 and all(labels == ticks[0] for labels in ticks)
     for _, _, axes in panels[1:] if shared else ():
         axes.set_yticklabels([])
-    width = 2.6 * len(panels) + 1.6 if shared or len(panels) > 2 else 4.8 * len(panels) + 1.6
+    narrow = not group and (shared or len(panels) > 2)
+    width = (2.6 if narrow else 4.6) * len(panels) + 1.6
     figure.set_size_inches(max(width, 5.5), max(heights) + 1.4)
-    panels[len(panels) // 2][2].set_xlabel(label, fontsize=9)
+    for _, _, axes in panels if len(panels) == 2 else [panels[len(panels) // 2]]:
+        axes.set_xlabel(label, fontsize=9)
     return _finish(figure, title)
 
 
@@ -289,6 +297,8 @@ def stacked(
     label: str = "failures, % of episodes (in the bars: how many)",
 ) -> "Figure":
     """A bar per line and group, as long as its `parts` are of `n`: columns of counts."""
+    from matplotlib.colors import to_rgb
+
     labels: list[str] = []
     places = []
     for row in table.to_dict("records"):
@@ -306,7 +316,7 @@ def stacked(
         drawn = axes.barh(places, percent, left=start, color=colour, height=0.82, edgecolor="white",
                           label=MEANINGS.get(part, part))  # fmt: skip
         counts = [str(n) if wide > 2 else "" for n, wide in zip(table[part], percent, strict=True)]
-        dark = part in ("case 1", "unprompted")
+        dark = np.dot(to_rgb(colour), (0.3, 0.59, 0.11)) < 0.5
         ink = dict(color="white" if dark else "black", fontsize=7.5)
         axes.bar_label(drawn, counts, label_type="center", **ink)
         start += percent
@@ -334,10 +344,10 @@ def funnel(table: "pd.DataFrame") -> "Figure":
     return curves(shown, "stage", panel="panel", series="method", label=label, dashed=bound)
 
 
-def _ends(rows: Sequence[Mapping[Any, Any]]) -> np.ndarray:
-    """How far an interval reaches to both sides, in %."""
-    ends = [[100 * (row["value"] - row["low"]) for row in rows]]
-    ends += [[100 * (row["high"] - row["value"]) for row in rows]]
+def _ends(rows: Sequence[Mapping[Any, Any]], scale: float = 100.0) -> np.ndarray:
+    """How far an interval reaches to both sides, by `scale`."""
+    ends = [[scale * (row["value"] - row["low"]) for row in rows]]
+    ends += [[scale * (row["high"] - row["value"]) for row in rows]]
     return np.maximum(np.array(ends), 0)
 
 

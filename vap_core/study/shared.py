@@ -187,8 +187,8 @@ def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
     """
     import pandas as pd
 
-    pairs = pair_table(episodes).rename(columns={"SR": "both"}).assign(paper=paper_pair(ALL))
-    turns = sequence_table(episodes).assign(paper=paper_sequence()["both"])
+    pairs = pair_table(episodes).rename(columns={"SR": "both"}).assign(paper=paper_pair(ALL) / 100)
+    turns = sequence_table(episodes).assign(paper=paper_sequence()["both"] / 100)
     marks: Sequence[pd.DataFrame] = [
         tidy(turns[[*BY, "n", "both", "step 1", "paper"]], ["both", "step 1"]),
         tidy(pairs[[*BY, "n", "both", "paper"]], ["both"]),
