@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 from vap_core.base.errors import BadOutput
+from vap_core.recording.show import free_port
 from vap_make import pages as notebook_links
 from vap_make import pages as notebook_pages
 

@@ -454,5 +454,14 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
     even = rates.drop_duplicates(["method", "left"])
     even = even.assign(ends="chance", value=even["method"].map(chance).astype(float))
     lines = pd.concat([rates, even.sort_values("left")])
+    titles = {}
+    for method, of in episodes.groupby("method", observed=True):
+        touch = of["first_touch"].notna()
+        told = [
+            f"{(touch & which).sum()} of {which.sum()} {name}"
+            for name, which in (("successes", of["success"]), ("failures", ~of["success"]))
+        ]
+        titles[method] = f"{method}: of episodes that touch something\n{', '.join(told)}"
+    lines["method"] = lines["method"].map(titles)
     look = dict(panel="method", series="ends", label="peak on the target, %", dashed=["chance"])
     return charts.curves(lines, "left", label_x="calls before the first touch", **look)

@@ -76,7 +76,7 @@ def _panels(
     table: "pd.DataFrame", panel: str, size: tuple[float, float], columns: int = 5, **options: Any
 ) -> "tuple[Figure, list[tuple[str, pd.DataFrame, Axes]]]":
     """A figure with a panel of that size for each name in the column `panel`."""
-    names = names_in(table, panel)
+    names = names_in(table, panel) or [""]
     rows = -(-len(names) // columns)
     across = -(-len(names) // rows)
     figure = empty_figure(size[0] * across, size[1] * rows)
