@@ -1,14 +1,19 @@
 """Benches: what they count is exact on known work, and each runs."""
 
+import ast
 import re
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.command import refused, vap
-from vap_core.base.errors import UnknownName
-from vap_core.cli import bench
-from vap_core.cli.bench import PARTS, ROLLOUT_PARTS, Arm, Parts
+from vap_core.base.errors import BadOutput, BadStudy, UnknownName
+from vap_core.cli import bench, timing
+from vap_core.cli.bench import PARTS, ROLLOUT_PARTS, Arm, LoopProcess
+from vap_core.cli.timing import Parts
 
 
 class Clock:
@@ -113,20 +118,94 @@ def test_arms_follow_each_other_in_turn_and_warm_ones_do_not_count() -> None:
     assert [len(each.costs) for each in arms] == [2, 2]
 
 
-def test_what_is_wrong_is_refused() -> None:
-    with pytest.raises(UnknownName, match="there is no .*mend"):
-        bench.resolve("vap_core.attend:Attender.no")
+def test_the_earlier_checkout_is_the_denominator(tmp_path: Path) -> None:
+    old = {"loop": "lerobot", "code": "old", "cpu": "best"}
+    arms = [
+        arm("1", [8.0, 8.0], **{**old, "cpu": "as it comes"}, wall="as it comes"),
+        arm("4", [6.0, 6.0], **old, wall="best"),
+        arm("4, each a process", [4.0, 4.0], **{**old, "cpu": ""}, wall="best"),
+        arm("4", [3.0, 3.0], **{**old, "code": "new"}, wall="best"),
+        arm("ours", [2.0, 3.0], loop="ours", code="new", cpu="at calls", wall="at calls"),
+    ]
+    assert bench.speed_up(arms, "cpu", "at calls", "as it comes")[0] == pytest.approx(
+        (4.0 * 8 / 3) ** 0.5
+    )
+    middle, low, high = bench.speed_up(arms, "cpu", "at calls", "best")
+    assert middle == pytest.approx((3.0 * 2.0) ** 0.5)
+    assert low < 2.0 < 3.0 < high
+    assert bench.speed_up(arms, "wall", "at calls", "best")[0] == pytest.approx(
+        (2.0 * 4 / 3) ** 0.5
+    )
+    about = bench.provenance(command="a command")
+    bench.write(tmp_path / "new" / "eval.json", "eval", about, arms)
+    again, kept = bench.read(tmp_path / "new" / "eval.json")
+    assert again == about
+    assert [replace(each, work=arms[0].work) for each in kept] == [
+        replace(each, work=arms[0].work) for each in arms
+    ]
+
+
+def test_what_is_wrong_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bad.json").write_text("{}")
+    (tmp_path / "old" / "vap_core").mkdir(parents=True)
+    (tmp_path / "old" / "vap_core" / "__init__.py").write_text("raise RuntimeError('a fault')\n")
+
+    def ends() -> None:
+        with LoopProcess(tmp_path / "old", bench.QUICK, tmp_path / "scratch"):
+            pass
+
+    calls = (
+        (lambda: bench.read(tmp_path / "bad.json"), BadOutput, "holds no measurement"),
+        (lambda: bench.resolve("vap_core.attend:Attender.no"), UnknownName, "there is no .*mend"),
+        (
+            lambda: LoopProcess(tmp_path, bench.QUICK, tmp_path),
+            BadStudy,
+            "is no checkout of this package; make one: git worktree",
+        ),
+        (ends, BadStudy, "lerobot's loop of .* ended: RuntimeError: a fault"),
+    )
+    for call, error, said in calls:
+        with pytest.raises(error, match=said):
+            call()
     assert "bench: 'nothing' is unknown; known: eval" in refused("bench", "nothing")
 
 
+def test_lerobots_loop_needs_only_what_an_earlier_checkout_has() -> None:
+    """Names that timing.py imports of the package: all are in 1cce9d7."""
+    names = set()
+    for node in ast.walk(ast.parse(Path(timing.__file__).read_text())):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("vap_core"):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    assert {name.removeprefix("vap_core.") for name in names} == {
+        "memory.register", "memory.save", "perception.stacks.load_stack",
+        "policies.lerobot.adapter.load_policy", "policies.lerobot.step.VapEnvConfig",
+        "policies.lerobot.step.attach", "policies.lerobot.toy_pi0.Toy",
+        "policies.lerobot.toy_pi0.save_toy", "policies.lerobot.toy_pi0.toy_sizes",
+        "simulation.suites", "simulation.assets.objects.get_object",
+        "simulation.studio.reference_views",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("candidates", [1, 2, 3, 5])
+def test_scale_places_so_many_objects_apart(candidates: int) -> None:
+    rows = bench.rows_with(7, candidates, cameras=2, episodes=4)
+    assert len(rows) == 4
+    for row in rows:
+        names = [place.model for place in row.placements]
+        assert len(set(names)) == candidates
+        assert names[0] == row.target
+        assert (row.max_steps, row.cameras) == (7, ("front", "side"))
+        for one, other in combinations(row.placements, 2):
+            assert np.hypot(one.x - other.x, one.y - other.y) > 0.089
+
+
 @pytest.mark.sweep
-@pytest.mark.parametrize("what", ["step", "profile", "eval", "policy"])
+@pytest.mark.parametrize("what", ["step", "profile", "scale", "eval", "policy"])
 def test_a_bench_runs(what: str, tmp_path: Path) -> None:
     done = vap("bench", what, "--quick", "--json", tmp_path / "found.json")
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert found["bench"] == what
-    assert all(len(each["costs"]) == 2 for each in found["arms"])
+    _, arms = bench.read(tmp_path / "found.json")
+    assert all(len(each.costs) == 2 for each in arms)
 
 
 def test_a_stack_is_timed() -> None:

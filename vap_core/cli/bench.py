@@ -4,7 +4,6 @@ A bench is a list of arms. They follow each other in turn, so that a slow moment
 falls on all of them; `table` compares each with the first of its axis.
 """
 
-import functools
 import json
 import os
 import subprocess
@@ -13,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +21,7 @@ import typer
 
 from vap_core.base.errors import command
 from vap_core.cli.command import StackName
+from vap_core.cli.timing import Parts
 
 if TYPE_CHECKING:
     from vap_core.rollout.loop import Trial
@@ -33,67 +33,6 @@ app = typer.Typer()
 Cost = dict[str, Any]
 """`wall` and `cpu` seconds, and CPU seconds by `parts`."""
 BATCH = 5
-
-
-ABSENT = object()
-
-
-class Parts:
-    """Seconds and calls by part, of functions that are hooked for a while.
-
-    A part's seconds are without those of the parts that it calls. A part that is hooked as `whole`
-    keeps them: inside it, no other part is counted.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.process_time) -> None:
-        self.clock = clock
-        self.seconds: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
-        self._inside: list[float] = []
-        self._whole = False
-
-    @contextmanager
-    def hooked(self, owner: Any, name: str, part: str, *, whole: bool = False) -> Iterator[None]:
-        """Inside, calls of `owner.name` count for `part`; `owner` is a module, class or object."""
-        before = vars(owner).get(name, ABSENT)
-        setattr(owner, name, self.timed(getattr(owner, name), part, whole=whole))
-        try:
-            yield
-        finally:
-            if before is ABSENT:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, before)
-
-    def timed(
-        self, work: Callable[..., Any], part: str, *, whole: bool = False
-    ) -> Callable[..., Any]:
-        """`work`, whose calls count for `part`."""
-        self.seconds.setdefault(part, 0.0)
-        self.calls.setdefault(part, 0)
-
-        @functools.wraps(work)
-        def counted(*args: Any, **kwargs: Any) -> Any:
-            if self._whole:
-                return work(*args, **kwargs)
-            self._whole = whole
-            self._inside.append(0.0)
-            start = self.clock()
-            try:
-                return work(*args, **kwargs)
-            finally:
-                seconds = self.clock() - start
-                self.seconds[part] += seconds - self._inside.pop()
-                self.calls[part] += 1
-                self._whole = False
-                if self._inside:
-                    self._inside[-1] += seconds
-
-        return counted
-
-    def with_rest(self, total: float) -> dict[str, float]:
-        """Seconds by part, and as "rest" what `total` seconds have beyond them."""
-        return {**self.seconds, "rest": total - sum(self.seconds.values())}
 
 
 @dataclass
@@ -132,16 +71,12 @@ def measure(arms: Sequence[Arm], repeats: int, warm: int = 1) -> None:
 
 
 def table(arms: Sequence[Arm], clock: str = "cpu") -> str:
-    """Every arm: milliseconds, times the first of its axis with a 95 % interval, its parts.
-
-    An arm whose `facts` name a clock is measured by that one alone.
-    """
+    """Every arm: milliseconds, times the first of its axis with a 95 % interval, its parts."""
     import numpy as np
 
     from vap_core.base.files import align
     from vap_core.study.stats import ratio
 
-    arms = [arm for arm in arms if arm.facts.get("clock", clock) == clock]
     parts = list(dict.fromkeys(part for arm in arms for part in arm.costs[0].get("parts", ())))
     rows = [["", "", f"{clock} ms", "lowest .. highest", "times the first [95 %]", *parts]]
     firsts: dict[str, Arm] = {}
@@ -368,9 +303,125 @@ def profile(folder: Path, quick: bool) -> list[Arm]:
     return arms
 
 
+CONDITIONS: dict[str, list[dict[str, Any]]] = {
+    "cameras": [{"cameras": n} for n in (1, 2, 3)],
+    "image size": [{"image_size": size} for size in (224, 448, (480, 640))],
+    "objects of the category": [{"candidates": n} for n in (1, 2, 3, 5)],
+    "batch": [{"batch": n, "episodes": 10} for n in (1, 5, 10)],
+}
+"""Axes of `bench scale`; what is not said is one camera of 224 px, three objects, batches of 5."""
+SCALE = ("vlabench", "select-cup")
+LOOKALIKES = tuple(f"paper-cup-lookalike-{i}" for i in range(1, 7))
 TOY: dict[str, int] = {
     "image": 128, "patch": 16, "width": 128, "layers": 4, "expert": 96, "chunk": 4, "denoise": 10,
 }  # fmt: skip
+
+
+def rows_with(
+    steps: int, candidates: int = 3, cameras: int = 1, episodes: int = 2
+) -> list["EpisodeRow"]:
+    """Episodes with so many objects of the category in view, apart, the target among them."""
+    from vap_core.simulation import suites
+
+    listed = suites.rows(*SCALE)
+    views = suites.suite(SCALE[0]).cameras[:cameras]
+    places = [place for row in listed for place in row.placements]
+    found = []
+    for row in listed[:episodes]:
+        placed = list(row.placements[:candidates])
+        unused = [name for name in LOOKALIKES if name not in {each.model for each in placed}]
+        for place in places:
+            if len(placed) == candidates:
+                break
+            if min((place.x - p.x) ** 2 + (place.y - p.y) ** 2 for p in placed) >= 0.09**2:
+                placed.append(replace(place, model=unused.pop()))
+        found.append(replace(row, placements=tuple(placed), cameras=views, max_steps=steps))
+    return found
+
+
+def scale(folder: Path, quick: bool) -> list[Arm]:
+    """How the cost of an episode grows with cameras, image size, candidates, batch and workers."""
+    from importlib.util import find_spec
+
+    from vap_core.attend import Attender
+    from vap_core.memory import load_bank
+    from vap_core.perception.stacks import load_stack
+    from vap_core.policies.lerobot.adapter import load_policy
+    from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
+    from vap_core.policies.protocol import MINI
+    from vap_core.rollout.loop import Trial, rollout
+    from vap_core.rollout.prompters import TintPrompter
+    from vap_core.simulation import suites
+    from vap_core.simulation.env import Env
+    from vap_core.simulation.suites.open_row import build_scene
+    from vap_core.study import engine, workers
+    from vap_core.study.trials import Study, register_personal
+
+    steps = 2 if quick else 20
+    suite = suites.suite(SCALE[0])
+    register_personal(Study((SCALE,), ("vap",)), folder / "memory")
+    prompter = TintPrompter(Attender(load_stack("embedded"), load_bank(folder / "memory")))
+    scene = build_scene(SCALE[0], ("paper-cup-personal", *LOOKALIKES))
+    env, toy = Env(scene, control=suite.control), Toy(**TOY)
+    policies = {}
+    with toy_sizes(toy):
+        for n in range(1, 1 + len(suite.cameras)):
+            sizes = (len(env.state()), env.action_size)
+            save_toy(folder / f"pi0-{n}", suite.cameras[:n], *sizes, toy)
+            policies[n] = load_policy(folder / f"pi0-{n}", "cpu")
+    arms = []
+    for axis, conditions in CONDITIONS.items():
+        for given in conditions:
+            more = dict(given)
+            size, batch = more.pop("image_size", 224), more.pop("batch", BATCH)
+            rows = rows_with(steps, **more)
+            trial = Trial(
+                method="vap",
+                scene=scene,
+                policy=policies[more.get("cameras", 1)],
+                prompter=prompter,
+                control=suite.control,
+                sensor=suite.sensor,
+                follow="call",
+                image_size=size,
+            )
+
+            def work(trial: "Trial" = trial, rows: Any = rows, batch: int = batch) -> Cost:
+                with profiled(ROLLOUT_PARTS) as cost:
+                    for episode in rollout(trial, rows, batch=batch):
+                        assert episode.outcome.status != "error", episode.outcome.detail
+                return cost
+
+            name = str(next(iter(given.values())))
+            arms.append(Arm(axis, name, work, len(rows)))
+    tasks = tuple(("simpler-bridge", task) for task in TASKS["simpler-bridge"])
+    study = Study(tasks, ("vap",), episodes=1 if quick else 10, policy=MINI, follow="call")
+    ways: dict[str, Any] = {"1": workers.results, "2": workers.results}
+    if find_spec("ray") is not None and not quick:
+        ways["2, Ray"] = workers.ray_executor(local_cluster(2))
+    for name, executor in ways.items():
+
+        def spread(name: str = name, executor: Any = executor) -> None:
+            out = Path(tempfile.mkdtemp(dir=folder))
+            engine.run(
+                study, out, workers=int(name[0]), record="none", progress=False, executor=executor
+            )
+
+        arms.append(Arm("workers (wall)", name, spread, study.episodes or 1))
+    return arms
+
+
+def local_cluster(cpus: int) -> str:
+    """The address of a Ray cluster of one node on this machine, on loopback, until this ends."""
+    import atexit
+
+    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    from ray.cluster_utils import Cluster
+
+    head = {"num_cpus": cpus, "node_ip_address": "127.0.0.1", "object_store_memory": 2**28}
+    nodes = Cluster(initialize_head=True, head_node_args={**head, "include_dashboard": False})
+    atexit.register(nodes.shutdown)
+    return str(nodes.address)
 
 
 def stack(folder: Path, quick: bool, kind: str, device: str | None = None) -> list[Arm]:
@@ -435,91 +486,137 @@ def policy(folder: Path, quick: bool) -> list[Arm]:
     return arms
 
 
-LOOPS = ((1, False), (4, False), (4, True))
-"""How lerobot's loop runs: with so many environments, and whether each is a process."""
+@dataclass(frozen=True)
+class Plan:
+    """What `bench eval` runs: so many episodes of so many steps; `loops` are lerobot's numbers of
+    environments, and whether each is a process."""
+
+    episodes: int = 8
+    steps: int = 40
+    toy: dict[str, int] = field(default_factory=lambda: TOY)
+    loops: tuple[tuple[int, bool], ...] = ((1, False), (4, False), (4, True))
+    suite: str = "simpler-bridge"
+    task: str = "put-camera"
 
 
-def evaluate(folder: Path, quick: bool, ended: ExitStack) -> list[Arm]:
+QUICK = Plan(2, 2, {**TOY, "image": 64, "width": 32, "layers": 1, "denoise": 2}, ((1, False),))
+
+
+class LoopProcess:
+    """timing.py as a script with the package of one checkout, warm; it ends with the block.
+
+    Raises: BadStudy when the folder is no checkout, or when the process ends early.
+    """
+
+    def __init__(self, checkout: Path, plan: Plan, folder: Path) -> None:
+        from vap_core.base.errors import BadStudy
+        from vap_core.base.files import code_version
+
+        package = checkout.resolve() / "vap_core" / "__init__.py"
+        if not package.is_file():
+            raise BadStudy(
+                f"bench eval: {checkout} is no checkout of this package; "
+                "make one: git worktree add DIR 1cce9d7"
+            )
+        folder.mkdir(parents=True)
+        self.code = code_version(package.parent)
+        self._errors = folder / "stderr.txt"
+        (folder / "plan.json").write_text(json.dumps(asdict(plan)))
+        script = Path(__file__).with_name("timing.py")
+        with self._errors.open("w") as errors:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(script), str(folder), str(folder / "plan.json")],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                cwd=folder,
+                env={**os.environ, "PYTHONPATH": str(checkout.resolve())},
+            )
+
+    def __enter__(self) -> "LoopProcess":
+        self._answer()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:  # it closes its environments, which may be processes, first
+            self._process.communicate(timeout=30)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
+
+    def run(self, **arm: Any) -> Cost:
+        """One evaluation of all episodes: n_envs, in_processes, threads, videos."""
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # where the process has died, the answer says why
+            self._process.stdin.write(json.dumps(arm) + "\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Cost:
+        from vap_core.base.errors import BadStudy
+
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.communicate()
+            said = self._errors.read_text().strip().splitlines() or ["it said nothing"]
+            raise BadStudy(f"bench eval: lerobot's loop of {self.code} ended: {said[-1][:160]}")
+        answer: Cost = json.loads(line)
+        return answer
+
+
+def evaluate(folder: Path, quick: bool, earlier: Path | None, ended: ExitStack) -> list[Arm]:
     """Our rollouts against lerobot's own evaluation loop: the same toy PI0, episodes and VAP.
 
-    lerobot's loop is `lerobot.scripts.lerobot_eval.eval_policy`, called as its command calls it.
-    VAP is a step of its pipeline, counted in "rest". The CPU time of environments in processes of
-    their own is unknown.
+    lerobot's loop shares `attend` with ours and so gets faster when ours does: `earlier` names a
+    checkout whose loop is the fixed denominator.
     """
-    import numpy as np
-    import torch
-    from lerobot.policies import make_pre_post_processors
-    from lerobot.scripts.lerobot_eval import eval_policy
-
+    import vap_core
     from vap_core.attend import Attender
+    from vap_core.base.files import code_version
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
-    from vap_core.policies.lerobot.step import VapEnvConfig, attach
-    from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
+    from vap_core.policies.lerobot.toy_pi0 import Toy, toy_sizes
     from vap_core.rollout.loop import Trial, rollout
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.suites.open_row import build_scene, models_of
-    from vap_core.study.trials import Study, register_personal
 
-    known, task = "simpler-bridge", "put-camera"
-    episodes, steps = (2, 2) if quick else (8, 40)
-    suite = suites.suite(known)
-    rows = [replace(row, max_steps=steps) for row in suites.rows(known, task)[:episodes]]
-    register_personal(Study(((known, task),), ("vap",)), folder / "memory")
-    config = VapEnvConfig(task=f"{known}/{task}", max_steps=steps)
-    sizes = (config.features["agent_pos"].shape[0], config.features["action"].shape[0])
-    toy = Toy(**TOY)
-    ended.enter_context(toy_sizes(toy))
-    save_toy(folder / "pi0", suite.cameras, *sizes, toy)
-    attach(folder / "pi0", folder / "vap", folder / "memory")
-    loaded = load_policy(folder / "pi0", "cpu")
-    before, after = config.get_env_processors()
-    pipelines = make_pre_post_processors(loaded.policy.config, str(folder / "vap"))
-    cores = torch.get_num_threads()
+    plan = QUICK if quick else Plan()
+    here = Path(vap_core.__file__).resolve().parents[1]
     arms = []
-    for n, in_processes in LOOPS[: 1 if quick else None]:
-        env: Any = config.create_envs(n, use_async_envs=in_processes)[known][0]
-        ended.callback(env.close)
-        env.reset(seed=list(range(n)))
-        env.step(np.zeros((n, sizes[1]), np.float32))
+    for i, checkout in enumerate(filter(None, (earlier, here))):
+        process = ended.enter_context(LoopProcess(checkout, plan, folder / f"lerobot-{i}"))
+        for n, in_processes in plan.loops:
+            for threads in sorted({1, os.cpu_count() or 1}):
+                given = {"n_envs": n, "in_processes": in_processes, "threads": threads}
 
-        def loop(env: Any = env, n: int = n) -> Cost:
-            threads = torch.get_num_threads()
-            torch.set_num_threads(cores)
-            counted = Parts()
-            with ExitStack() as hooks:
-                for owner, name, part in (
-                    (env, "step", "environment"),
-                    (env, "reset", "environment"),
-                    (loaded.policy, "select_action", "policy"),
-                ):
-                    hooks.enter_context(counted.hooked(owner, name, part, whole=True))
-                wall, cpu = time.perf_counter(), time.process_time()
-                eval_policy(
-                    env=env,
-                    policy=loaded.policy,
-                    env_preprocessor=before,
-                    env_postprocessor=after,
-                    preprocessor=pipelines[0],
-                    postprocessor=pipelines[1],
-                    n_episodes=episodes,
-                    max_episodes_rendered=10 if n == 1 else 0,
-                    videos_dir=folder / "videos" if n == 1 else None,
-                    start_seed=0,
-                )
-                wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-            torch.set_num_threads(threads)
-            return {"wall": wall, "cpu": cpu, "parts": counted.with_rest(cpu)}
+                def loop(given: Any = given, process: LoopProcess = process, n: int = n) -> Cost:
+                    return process.run(**given, videos=n == 1)
 
-        where, facts = (", each a process", {"clock": "wall"}) if in_processes else ("", {})
-        arms.append(Arm("an episode", f"lerobot: {n} envs{where}", loop, episodes, facts))
+                name = f"lerobot {process.code}: {n} envs, {threads} threads"
+                comes = n == 1
+                facts = {
+                    "loop": "lerobot",
+                    "code": process.code,
+                    "cpu": ("as it comes" if comes else "best") * (threads == 1 > in_processes),
+                    "wall": "as it comes" if comes else "best",
+                }
+                name += ", each a process" * in_processes
+                arms.append(Arm("an episode", name, loop, plan.episodes, facts))
+    rows = [replace(r, max_steps=plan.steps) for r in suites.rows(plan.suite, plan.task)]
+    rows = rows[: plan.episodes]
+    suite = suites.suite(plan.suite)
+    with toy_sizes(Toy(**plan.toy)):
+        loaded = load_policy(folder / "lerobot-0" / "pi0", "cpu")
+    bank = load_bank(folder / "lerobot-0" / "memory")
     trial = Trial(
         method="vap",
-        scene=build_scene(known, models_of(rows)),
+        scene=build_scene(plan.suite, models_of(rows)),
         policy=loaded,
-        prompter=TintPrompter(Attender(load_stack("embedded"), load_bank(folder / "memory"))),
+        prompter=TintPrompter(Attender(load_stack("embedded"), bank)),
         control=suite.control,
         sensor=suite.sensor,
     )
@@ -531,8 +628,33 @@ def evaluate(folder: Path, quick: bool, ended: ExitStack) -> list[Arm]:
                     assert episode.outcome.status != "error", episode.outcome.detail
             return cost
 
-        arms.append(Arm("an episode", f"ours, {name}", roll, episodes))
+        facts = {"loop": "ours", "code": code_version(), "cpu": name, "wall": name}
+        arms.append(Arm("an episode", f"ours, {name}", roll, plan.episodes, facts))
     return arms
+
+
+def speed_up(arms: Sequence[Arm], clock: str, ours: str, theirs: str) -> tuple[float, float, float]:
+    """How many times as fast our loop is as lerobot's: mean within repeats, 95 % interval.
+
+    `ours` is "every step" or "at calls"; `theirs` "as it comes" or "best", the fastest of the first
+    checkout that was measured, the fixed denominator.
+    """
+    import numpy as np
+
+    from vap_core.study.stats import ratio
+
+    code = next(arm.facts["code"] for arm in arms if arm.facts["loop"] == "lerobot")
+    slow = [
+        arm.seconds(clock)
+        for arm in arms
+        if (arm.facts["loop"], arm.facts["code"], arm.facts[clock]) == ("lerobot", code, theirs)
+    ]
+    (fast,) = (
+        arm.seconds(clock)
+        for arm in arms
+        if (arm.facts["loop"], arm.facts[clock]) == ("ours", ours)
+    )
+    return ratio(min(slow, key=lambda seconds: float(np.median(seconds))), fast)
 
 
 def provenance(**about: Any) -> dict[str, Any]:
@@ -574,6 +696,20 @@ def write(path: Path, bench: str, about: dict[str, Any], arms: Sequence[Arm]) ->
     with writing(path, "bench", "give --json another name"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, f"{text}\n".encode())
+
+
+def read(path: Path) -> tuple[dict[str, Any], list[Arm]]:
+    """The provenance and the arms of a measurement. Raises: BadOutput."""
+    from vap_core.base.errors import BadOutput
+
+    try:
+        found = json.loads(path.read_text())
+        return found["provenance"], [Arm(work=lambda: None, **arm) for arm in found["arms"]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise BadOutput(
+            f"bench: {path} holds no measurement ({type(error).__name__}); bench writes one by "
+            "--json."
+        ) from error
 
 
 COUNTED = ("files", "code", "nodes", "functions")
@@ -656,6 +792,7 @@ def size() -> str:
 BENCHES: dict[str, Callable[..., list[Arm]]] = {
     "step": step,
     "profile": profile,
+    "scale": scale,
     "eval": evaluate,
     "stack": stack,
     "policy": policy,
@@ -668,8 +805,9 @@ def bench(
         str,
         typer.Argument(
             help="step: the prompted control loop, a recording, a query; profile: a control step "
-            "of eval by part; eval: our loop against lerobot's own; stack: a stack's models; "
-            "policy: the shipped policies; size: how much code there is."
+            "of eval by part; scale: cost against cameras, image size, candidates, batch, workers "
+            "and Ray; eval: our loop against lerobot's own; stack: a stack's models; policy: the "
+            "shipped policies; size: how much code there is."
         ),
     ] = "step",
     stack: StackName = "foundation",
@@ -678,6 +816,13 @@ def bench(
         bool,
         typer.Option("--quick", help="To see that it runs; its numbers mean nothing."),
     ] = False,
+    lerobot_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="eval: a checkout of this repository at an earlier commit (git worktree add DIR "
+            "COMMIT), whose lerobot loop is measured, too, as the fixed denominator."
+        ),
+    ] = None,
     keep: Annotated[
         Path | None, typer.Option("--json", help="Keep the measurement in this file, too.")
     ] = None,
@@ -701,12 +846,21 @@ def bench(
         if what == "stack":
             more = {"kind": stack}
         elif what == "eval":
-            more = {"ended": ended}
+            more = {"earlier": lerobot_from, "ended": ended}
         arms = BENCHES[what](Path(scratch), quick, **more)
         measure(arms, 2 if quick else repeats)
     about = provenance(command=command("bench", what), repeats=len(arms[0].costs))
     print(f"{about['machine']}, {about['commit']}\n\n{table(arms)}")
-    if what in ("step", "eval"):
+    if what in ("step", "scale", "eval"):
         print(f"\n{table(arms, 'wall')}")
+    if what == "eval":
+        for ours in ("every step", "at calls"):
+            texts = [
+                in_brackets(speed_up(arms, "cpu", ours, how)) for how in ("as it comes", "best")
+            ]
+            print(
+                f"ours, {ours}: {texts[0]} times as fast as lerobot as it comes, "
+                f"{texts[1]} as its best"
+            )
     if keep is not None:
         write(keep, what, about, arms)
