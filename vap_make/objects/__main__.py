@@ -77,6 +77,10 @@ class Bake:
         if at == len(held):
             held.append(mesh)
         first, face = (sum(map(len, part)) for part in _parts(held[:at]))
+        solids = []
+        for s in form.solids():
+            turned = (s.axis, s.euler) if s.axis != "z" or any(s.euler) else ()
+            solids.append((s.kind, s.size, s.pos, *turned))
         row = {
             "name": model.name,
             "category": model.category,
@@ -86,14 +90,21 @@ class Bake:
             "mesh": (first, first + len(mesh.vertex), face, face + len(mesh.face)),
             "shape": model.shape,
             "texture": asdict(form.texture),
-            "solids": [(s.kind, s.size, s.pos, s.axis, s.euler) for s in form.solids()],
+            "solids": [
+                (
+                    s.kind,
+                    s.size,
+                    s.pos,
+                    *((s.axis, s.euler) if s.axis != "z" or any(s.euler) else ()),
+                )
+                for s in form.solids()
+            ],
         }
         self.rows.append({**row, "wall_px": wall} if wall else row)
 
     def lines(self) -> bytes:
-        return "".join(
-            f"{json.dumps(row, default=lambda part: part.tolist())}\n" for row in self.rows
-        ).encode()
+        short = json.JSONEncoder(separators=(",", ":"), default=lambda number: number.tolist())
+        return "".join(f"{short.encode(row)}\n" for row in self.rows).encode()
 
     def archive(self) -> bytes:
         """The same bytes for the same contents."""

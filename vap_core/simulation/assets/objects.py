@@ -170,7 +170,8 @@ def _catalogue() -> dict[str, ObjectModel]:
         colours = {part: tuple(paint[part]) for part in ("base", "ink", "accent")}
         texture = Texture(**{**paint, **colours})
         solids = []
-        for kind, size, pos, axis, euler in row["solids"]:
+        for kind, size, pos, *turned in row["solids"]:
+            axis, euler = turned or ("z", (0, 0, 0))
             solids.append(Solid(kind, tuple(size), tuple(pos), axis, tuple(euler)))
         mesh_at = (*row["mesh"],)
         form = Baked(
