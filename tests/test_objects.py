@@ -125,7 +125,7 @@ def test_generic_and_evaluation_parameters_are_disjoint():
 
 @pytest.mark.parametrize("name", ["cup-mine", "cup-generic-7", "mug-generic-0001", "cup-generic-"])
 def test_unknown_name_lists_what_exists(name):
-    with pytest.raises(UnknownName, match=r"objects: object .* is unknown; known: .*cup-personal"):
+    with pytest.raises(UnknownName, match=r"objects: object .* is unknown; known: .*cup-lookalike"):
         get_object(name)
 
 

@@ -90,15 +90,7 @@ class Bake:
             "mesh": (first, first + len(mesh.vertex), face, face + len(mesh.face)),
             "shape": model.shape,
             "texture": asdict(form.texture),
-            "solids": [
-                (
-                    s.kind,
-                    s.size,
-                    s.pos,
-                    *((s.axis, s.euler) if s.axis != "z" or any(s.euler) else ()),
-                )
-                for s in form.solids()
-            ],
+            "solids": solids,
         }
         self.rows.append({**row, "wall_px": wall} if wall else row)
 
