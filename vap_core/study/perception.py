@@ -15,7 +15,6 @@ from jaxtyping import Float, Float32, Float64
 
 from vap_core.associate import PAIRINGS, Pairing, Sighting, associate, compare_views
 from vap_core.base.types import (
-    Ballot,
     Boxes,
     Camera,
     Mask,
@@ -31,7 +30,6 @@ from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
-from vap_core.simulation.env import Env
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
 from vap_core.simulation.types import EpisodeRow
@@ -87,12 +85,8 @@ class View:
 
     def boxes(self) -> dict[str, Box]:
         """The box of every object of which anything shows."""
-        boxes = {}
-        for name, mask in self.masks.items():
-            box = mask_box(mask)
-            if box is not None:
-                boxes[name] = box
-        return boxes
+        boxes = {name: mask_box(mask) for name, mask in self.masks.items()}
+        return {name: box for name, box in boxes.items() if box is not None}
 
     def visible(self) -> dict[str, Mask]:
         """The masks large enough to count."""
@@ -115,7 +109,12 @@ def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[
             env = make_env(scene, suite, image_size=size)
             for row in group:
                 env.reset(row)
-                yield _opening_views(env, row)
+                masks = env.truth(masks=True).masks
+                optics = {each.name: each for each in env.cameras()}
+                yield [
+                    View(row, camera, rgb, masks[camera], optics[camera])
+                    for camera, rgb in env.observe().images.items()
+                ]
 
 
 @cache
@@ -154,45 +153,75 @@ def survey_view(
 
     Raises: BadEncoder when the encoder gives numbers that are not finite.
     """
-    boxes = view.boxes()
-    alike = _same_category(view)
-    best = _best_boxes(view, stack)
-    detections = []
-    for kind, found in best.items():
-        detections += _detections(found, kind=kind, view=view, boxes=boxes, alike=alike)
-    false_alarm = _false_alarm(view, stack)
-    true_boxes = _stack_boxes([boxes[name] for name in alike])
-    true_embeddings = stack.encoder([crop(view.rgb, box) for box in true_boxes])
-    object_rows = _object_rows(
-        view=view,
-        cosine=similarity(true_embeddings, memory[USUAL_K].embeddings),
-        best=best,
-        candidates=candidates,
-        boxes=boxes,
-        alike=alike,
-    )
-    view_row = _view_row(view, candidates, object_rows)
-    view_row |= _unseen_phrase(view, best, boxes) | false_alarm
-    view_row |= {"proposed": None, "mask_iou_true_box": None}
-    choices: list[TableRow] = []
-    if view_row["counts"]:
-        target_box = boxes[view.row.target]
-        true_box = Boxes(target_box[None], np.ones(1, np.float32), view.row.category)
-        view_row["proposed"] = _is_found(candidates.boxes.xyxy, target_box)
-        view_row["mask_iou_true_box"] = _segmented_iou(view, stack, true_box)
-        choices = _choices(
-            view=view,
-            stack=stack,
-            memory=memory,
-            candidates=candidates,
-            true_embeddings=true_embeddings,
-            alike=list(alike),
+    row, boxes, visible = view.row, view.boxes(), view.visible()
+    target, category = row.target, row.category
+    alike = [name for name in visible if _category(name) == category]
+    best = {"category": stack.category_detector([view.rgb], category, FLOOR)[0]}
+    if phrase := _take_turn(UNSEEN.get(category, ()), row.episode):
+        best["unseen"] = stack.category_detector([view.rgb], phrase, FLOOR)[0]
+    may_mean = {category, *AMBIGUOUS.get(category, ())}
+    others = [
+        box for name, box in boxes.items() if name not in alike and _category(name) in may_mean
+    ]
+    detections = [
+        {"asked": kind, "phrase": found.phrase, "score": float(score), "hit": hit}
+        for kind, found in best.items()
+        for score, hit in zip(
+            found.score,
+            match(found.xyxy, _stack_boxes([boxes[name] for name in alike]), _stack_boxes(others)),
+            strict=True,
         )
+        if hit is not None
+    ]
+    absent = _take_turn(_absent_categories(row), row.episode)
+    crops = [crop(view.rgb, boxes[name]) for name in alike]
+    embeddings = stack.encoder(crops)
+    cosine = similarity(embeddings, memory[USUAL_K].embeddings)
+    unseen = best["unseen"].xyxy[:TOP] if "unseen" in best else None
+    object_rows: list[TableRow] = [
+        {
+            "object": name,
+            "role": "target" if name == target else "look-alike",
+            "tier": "personal" if name == target else objects.tier(objects.get_object(name)),
+            "px": int(visible[name].sum()),
+            "recalled": _is_found(best["category"].xyxy[:TOP], boxes[name]),
+            "proposed": _is_found(candidates.boxes.xyxy, boxes[name]),
+            "cosine": float(each.mean()),
+            "recalled_unseen": None if unseen is None else _is_found(unseen, boxes[name]),
+        }
+        for name, each in zip(alike, cosine, strict=True)
+    ]
+    counts = target in visible
+    tier = "hard" if any(each["tier"] == "hard" for each in object_rows) else "standard"
+    view_row: TableRow = {
+        "target_px": int(view.masks[target].sum()),
+        "counts": counts,
+        "visible_alike": len(object_rows),
+        "tier": tier,
+        "candidates": len(candidates.boxes),
+        "unseen_phrase": phrase,
+        "unseen_proposed": None
+        if unseen is None or not counts
+        else _is_found(unseen, boxes[target]),
+        "absent_phrase": absent,
+        "false_alarm": len(stack.category_detector([view.rgb], absent)[0]) > 0,
+        "proposed": None,
+        "mask_iou_true_box": None,
+    }
+    choices: list[TableRow] = []
+    if counts:
+        true_box = Boxes(boxes[target][None], np.ones(1, np.float32), category)
+        view_row["proposed"] = _is_found(candidates.boxes.xyxy, boxes[target])
+        if unseen is not None:
+            view_row["unseen_proposed"] = _is_found(unseen, boxes[target])
+        view_row["mask_iou_true_box"] = _segmented_iou(view, stack, true_box)
+        found = _choices(view, stack, memory, candidates, embeddings, alike)
+        choices = [{"tier": tier, **choice} for choice in found]
     return {
         "views": [view_row],
         "objects": object_rows,
         "detections": detections,
-        "choices": [{"tier": view_row["tier"], **choice} for choice in choices],
+        "choices": choices,
     }
 
 
@@ -202,8 +231,7 @@ def object_under_box(view: View, box: Box) -> str:
     target = view.row.target
     if target in boxes and _is_found(box[None], boxes[target]):
         return target
-    all_boxes = _stack_boxes(list(boxes.values()))
-    overlap = _box_ious(box[None], all_boxes)[0]
+    overlap = _box_ious(box[None], _stack_boxes(list(boxes.values())))[0]
     if overlap.max(initial=0.0) < SAME_BOX:
         return "nothing"
     return list(boxes)[int(overlap.argmax())]
@@ -220,144 +248,29 @@ def match(
     It takes one that it overlaps by `at`, as in average precision. None for any other that is the
     same box as an ignored one: it counts neither way.
     """
-    with_wanted = _box_ious(found, wanted)
-    with_ignored = _box_ious(found, ignored)
     free = np.ones(len(wanted), bool)
     hits: list[bool | None] = []
-    for overlap, ignored_overlap in zip(with_wanted, with_ignored, strict=True):
-        chosen = -1
-        if len(wanted):
-            chosen = int(np.where(free, overlap, -1).argmax())
-        if chosen >= 0 and free[chosen] and overlap[chosen] >= at:
-            free[chosen] = False
+    both = zip(_box_ious(found, wanted), _box_ious(found, ignored), strict=True)
+    for overlap, ignored_overlap in both:
+        left = np.where(free, overlap, -1)
+        if left.max(initial=-1) >= at:
+            free[left.argmax()] = False
             hits.append(True)
-        elif ignored_overlap.max(initial=0.0) >= SAME_BOX:
-            hits.append(None)
         else:
-            hits.append(False)
+            hits.append(None if ignored_overlap.max(initial=0.0) >= SAME_BOX else False)
     return hits
 
 
-def _opening_views(env: Env, row: EpisodeRow) -> list[View]:
-    """The view of every camera of an environment that was just reset."""
-    masks = env.truth(masks=True).masks
-    optics = {}
-    for calibrated in env.cameras():
-        optics[calibrated.name] = calibrated
-    views = []
-    for camera, rgb in env.observe().images.items():
-        view = View(
-            row=row,
-            camera=camera,
-            rgb=rgb,
-            masks=masks[camera],
-            optics=optics[camera],
-        )
-        views.append(view)
-    return views
-
-
-def _same_category(view: View) -> dict[str, Mask]:
-    """The masks of the visible objects of the target's category."""
-    alike = {}
-    for name, mask in view.visible().items():
-        if objects.get_object(name).category == view.row.category:
-            alike[name] = mask
-    return alike
-
-
-def _best_boxes(view: View, stack: Stack) -> dict[str, Boxes]:
-    """The boxes down to FLOOR, best first, of the category and of its unseen phrase, if any."""
-    best = {"category": stack.category_detector([view.rgb], view.row.category, FLOOR)[0]}
-    phrase = _take_turn(UNSEEN.get(view.row.category, ()), view.row.episode)
-    if phrase:
-        best["unseen"] = stack.category_detector([view.rgb], phrase, FLOOR)[0]
-    return best
-
-
-def _false_alarm(view: View, stack: Stack) -> TableRow:
-    """Whether anything is found of a category that is absent."""
-    phrase = _take_turn(_absent_categories(view), view.row.episode)
-    found = stack.category_detector([view.rgb], phrase)[0]
-    return {"absent_phrase": phrase, "false_alarm": len(found) > 0}
-
-
-def _unseen_phrase(view: View, best: Mapping[str, Boxes], boxes: Mapping[str, Box]) -> TableRow:
-    """Whether the unseen phrase finds the target; None without such a phrase or visible target."""
-    if "unseen" not in best:
-        return {"unseen_phrase": "", "unseen_proposed": None}
-    target = view.row.target
-    proposed = None
-    if target in view.visible():
-        proposed = _is_found(best["unseen"].xyxy[:TOP], boxes[target])
-    return {"unseen_phrase": best["unseen"].phrase, "unseen_proposed": proposed}
-
-
-def _object_rows(
-    *,
-    view: View,
-    cosine: Float32[np.ndarray, "m k"],
-    best: Mapping[str, Boxes],
-    candidates: Proposals,
-    boxes: Mapping[str, Box],
-    alike: Mapping[str, Mask],
-) -> list[TableRow]:
-    """A row per object of `alike`: whether it was found, and its cosine with the references.
-
-    `best` are the boxes of each phrase, best first (`_best_boxes`).
-    """
-    rows = []
-    for i, (name, mask) in enumerate(alike.items()):
-        role = "look-alike"
-        if name == view.row.target:
-            role = "target"
-        recalled_unseen = None
-        if "unseen" in best:
-            recalled_unseen = _is_found(best["unseen"].xyxy[:TOP], boxes[name])
-        row: TableRow = {
-            "object": name,
-            "role": role,
-            "tier": _tier_in_view(name, view),
-            "px": int(mask.sum()),
-            "recalled": _is_found(best["category"].xyxy[:TOP], boxes[name]),
-            "proposed": _is_found(candidates.boxes.xyxy, boxes[name]),
-            "cosine": float(cosine[i].mean()),
-            "recalled_unseen": recalled_unseen,
-        }
-        rows.append(row)
-    return rows
-
-
-def _view_row(view: View, candidates: Proposals, object_rows: Sequence[TableRow]) -> TableRow:
-    """What a view shows, and how many candidates were found in it."""
-    target = view.row.target
-    tier = "standard"
-    for row in object_rows:
-        if row["tier"] == "hard":
-            tier = "hard"
-    return {
-        "target_px": int(view.masks[target].sum()),
-        "counts": target in view.visible(),
-        "visible_alike": len(object_rows),
-        "tier": tier,
-        "candidates": len(candidates.boxes),
-    }
-
-
-def _tier_in_view(name: str, view: View) -> str:
-    if name == view.row.target:
-        return "personal"
-    return objects.tier(objects.get_object(name))
+def _category(name: str) -> str:
+    return objects.get_object(name).category
 
 
 def _segmented_iou(view: View, stack: Stack, box: Boxes) -> float:
     """The IoU of the target's mask with the one that the segmenter draws from a single box."""
-    mask = stack.segmenter(view.rgb, box)[0]
-    return mask_iou(mask, view.masks[view.row.target])
+    return mask_iou(stack.segmenter(view.rgb, box)[0], view.masks[view.row.target])
 
 
 def _choices(
-    *,
     view: View,
     stack: Stack,
     memory: Mapping[int, PersonalObject],
@@ -370,7 +283,7 @@ def _choices(
     A row per number of references and rule. `alike` names the rows of `true_embeddings`.
     """
     target = view.row.target
-    target_ious: dict[tuple[float, ...], float] = {}
+    target_ious: dict[bytes, float] = {}
     rows = []
     for k, personal in memory.items():
         few, _ = nominate(view.rgb, personal, candidates, stack)
@@ -379,16 +292,17 @@ def _choices(
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:
             ballot = vote(election_scores(cosine, few.boxes), rule)
-            true_winner = vote(true_cosine, rule).winner
+            winner, true_winner = ballot.winner, vote(true_cosine, rule).winner
             assert true_winner is not None, "the target's true box is among them"
-            elected = _elected_object(view, few, ballot)
-            overlap = None
-            if elected == target and ballot.winner is not None:
-                candidate = _select_box(few.boxes, ballot.winner)
-                corners = tuple(candidate.xyxy[0].tolist())
-                if corners not in target_ious:
-                    target_ious[corners] = _segmented_iou(view, stack, candidate)
-                overlap = target_ious[corners]
+            elected, overlap = "", None
+            if winner is not None:
+                box = few.boxes.xyxy[[winner]]
+                elected = object_under_box(view, box[0])
+                if elected == target:
+                    if box.tobytes() not in target_ious:
+                        alone = Boxes(box, few.boxes.score[[winner]], few.boxes.phrase)
+                        target_ious[box.tobytes()] = _segmented_iou(view, stack, alone)
+                    overlap = target_ious[box.tobytes()]
             row: TableRow = {
                 "k": k,
                 "rule": rule,
@@ -397,79 +311,32 @@ def _choices(
                 "elected": elected,
                 "margin": ballot.margin,
                 "cosine_margin": ballot.cosine_margin,
-                "tie": _is_tie(ballot),
-                "likeness": None if ballot.winner is None else float(like[ballot.winner]),
+                "tie": winner is not None and bool(ballot.tied[winner]),
+                "likeness": None if winner is None else float(like[winner]),
                 "mask_iou": overlap,
             }
             rows.append(row)
     return rows
 
 
-def _elected_object(view: View, candidates: Proposals, ballot: Ballot) -> str:
-    """The object under the winner's box; "" when there are no candidates."""
-    if ballot.winner is None:
-        return ""
-    return object_under_box(view, candidates.boxes.xyxy[ballot.winner])
-
-
-def _is_tie(ballot: Ballot) -> bool:
-    return ballot.winner is not None and bool(ballot.tied[ballot.winner])
-
-
-def _select_box(boxes: Boxes, i: int) -> Boxes:
-    return Boxes(boxes.xyxy[[i]], boxes.score[[i]], boxes.phrase)
-
-
-def _detections(
-    found: Boxes,
-    *,
-    kind: str,
-    view: View,
-    boxes: Mapping[str, Box],
-    alike: Mapping[str, Mask],
-) -> list[TableRow]:
-    """Score and hit of every box that counts.
-
-    Boxes on objects that are too small do not count, nor boxes on kinds that the phrase may name
-    too.
-    """
-    category = view.row.category
-    ambiguous = {category, *AMBIGUOUS.get(category, ())}
-    wanted = [boxes[name] for name in alike]
-    ignored = []
-    for name, box in boxes.items():
-        if name not in alike and objects.get_object(name).category in ambiguous:
-            ignored.append(box)
-    hits = match(found.xyxy, _stack_boxes(wanted), _stack_boxes(ignored))
-    rows: list[TableRow] = []
-    for score, hit in zip(found.score, hits, strict=True):
-        if hit is not None:
-            rows.append({"asked": kind, "phrase": found.phrase, "score": float(score), "hit": hit})
-    return rows
-
-
-def _absent_categories(view: View) -> list[str]:
+def _absent_categories(row: EpisodeRow) -> list[str]:
     """Categories of which nothing is placed, and nothing that the same word may name."""
-    placed = {objects.get_object(place.model).category for place in view.row.placements}
-    absent = []
-    for category in objects.CATEGORIES:
-        ambiguous = {category, *AMBIGUOUS.get(category, ())}
-        if not placed & ambiguous:
-            absent.append(category)
-    return absent
+    placed = {_category(place.model) for place in row.placements}
+    return [
+        category
+        for category in objects.CATEGORIES
+        if not placed & {category, *AMBIGUOUS.get(category, ())}
+    ]
 
 
 def _take_turn(names: Sequence[str], number: int) -> str:
     """Each name in turn; "" when there is none."""
-    if not names:
-        return ""
-    return names[number % len(names)]
+    return names[number % len(names)] if names else ""
 
 
 def _is_found(found: Float32[np.ndarray, "n 4"], box: Box) -> bool:
     """Whether any of the boxes found agrees with `box`."""
-    overlap = _box_ious(found, box[None])
-    return bool(overlap.max(initial=0.0) >= SAME_BOX)
+    return bool(_box_ious(found, box[None]).max(initial=0.0) >= SAME_BOX)
 
 
 def _box_ious(
@@ -493,15 +360,11 @@ def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tab
 
     Raises: as `registered_object` and `agreements`.
     """
-    target = episode[0].row.target
-    memory = {}
-    for k in ks:
-        memory[k], _ = registered_object(stack, target, k)
+    memory = {k: registered_object(stack, episode[0].row.target, k)[0] for k in ks}
     candidates = find_candidates(episode, stack)
     tables: Tables = {"views": [], "objects": [], "detections": [], "choices": [], "agreements": []}
     for view, of_view in zip(episode, candidates, strict=True):
-        of_tables = survey_view(view=view, stack=stack, memory=memory, candidates=of_view)
-        for name, rows in of_tables.items():
+        for name, rows in survey_view(view, stack, memory, of_view).items():
             tables[name] += [{**view.key, **row} for row in rows]
     if len(episode) > 1:
         tables["agreements"] = agreements(episode, candidates, memory[USUAL_K], stack)
@@ -521,88 +384,35 @@ def agreements(
 
     Raises: BadViews, as `associate`; BadEncoder, as `compare`.
     """
-    few = []
-    for view, of_view in zip(episode, candidates, strict=True):
-        few.append(nominate(view.rgb, personal, of_view, stack)[0])
-    sightings = _sightings(episode, few, personal, stack)
-    single = {camera: vote(sighting.cosine).winner for camera, sighting in sightings.items()}
-    pairings: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
     row = episode[0].row
+    few, sightings = {}, {}
+    for view, of_view in zip(episode, candidates, strict=True):
+        chosen = nominate(view.rgb, personal, of_view, stack)[0]
+        cosine = election_scores(compare(personal, chosen, stack), chosen.boxes)
+        few[view.camera] = chosen.boxes.xyxy
+        sightings[view.camera] = Sighting(cosine, chosen.boxes.xyxy, camera=view.optics)
+    ways: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
     table = []
-    for name, pairing in pairings.items():
-        association = None
-        if pairing is not None:
-            association = associate(sightings, pairing)
-        chosen: Mapping[str, int | None] = single
-        margin = None
-        if association is not None:
-            chosen = association.chosen
-            margin = association.margin
-        highlighted = _highlighted_objects(episode, few, chosen)
-        n_right, n_views = _count_right(episode, highlighted)
+    for name, pairing in ways.items():
+        found = None if pairing is None else associate(sightings, pairing)
+        highlighted: dict[str, str | None] = {}
+        for view in episode:
+            i = vote(sightings[view.camera].cosine).winner
+            if found is not None:
+                i = found.chosen[view.camera]
+            under = None if i is None else object_under_box(view, few[view.camera][i])
+            highlighted[view.camera] = f"nothing in {view.camera}" if under == "nothing" else under
+        shown = [view.camera for view in episode if row.target in view.visible()]
         agreement: TableRow = {
             "suite": row.suite,
             "task": row.task,
             "episode": row.episode,
             "target": row.target,
             "associate": name,
-            "case": compare_views(_distinguish_nothing(highlighted), row.target),
-            "right": n_right,
-            "views": n_views,
-            "margin": margin,
+            "case": compare_views(highlighted, row.target),
+            "right": sum(highlighted[camera] == row.target for camera in shown),
+            "views": len(shown),
+            "margin": None if found is None else found.margin,
         }
         table.append(agreement)
     return table
-
-
-def _sightings(
-    episode: Sequence[View],
-    candidates: Sequence[Proposals],
-    personal: PersonalObject,
-    stack: Stack,
-) -> dict[str, Sighting]:
-    """The candidates of each view, by camera, as `associate` takes them."""
-    sightings = {}
-    for view, of_view in zip(episode, candidates, strict=True):
-        sightings[view.camera] = Sighting(
-            cosine=election_scores(compare(personal, of_view, stack), of_view.boxes),
-            xyxy=of_view.boxes.xyxy,
-            camera=view.optics,
-        )
-    return sightings
-
-
-def _highlighted_objects(
-    episode: Sequence[View],
-    candidates: Sequence[Proposals],
-    chosen: Mapping[str, int | None],
-) -> dict[str, str | None]:
-    """The object under the chosen box of each camera; None where none is chosen."""
-    highlighted: dict[str, str | None] = {}
-    for view, of_view in zip(episode, candidates, strict=True):
-        i = chosen[view.camera]
-        highlighted[view.camera] = None
-        if i is not None:
-            highlighted[view.camera] = object_under_box(view, of_view.boxes.xyxy[i])
-    return highlighted
-
-
-def _count_right(episode: Sequence[View], highlighted: Mapping[str, str | None]) -> tuple[int, int]:
-    """In how many views the target is highlighted, and how many show it."""
-    target = episode[0].row.target
-    n_right = 0
-    n_views = 0
-    for view in episode:
-        if target in view.visible():
-            n_views += 1
-            n_right += highlighted[view.camera] == target
-    return n_right, n_views
-
-
-def _distinguish_nothing(highlighted: Mapping[str, str | None]) -> dict[str, str | None]:
-    """The same objects, with "nothing" as another thing in every camera."""
-    distinct = dict(highlighted)
-    for camera, name in highlighted.items():
-        if name == "nothing":
-            distinct[camera] = f"nothing in {camera}"
-    return distinct
