@@ -401,7 +401,9 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     shown = pd.concat(marks)
     label = "attention per area before the first touch, whole view = 1 [95 %]"
     most = 1.05 * float(shown["high"].max())
-    look = dict(group="suite", series="region", label=label, scale=1.0, limits=(0.0, most))
+    look: dict[str, Any] = dict(
+        group="suite", series="region", label=label, scale=1.0, limits=(0.0, most)
+    )
     return charts.dots(shown, "line", **look)
 
 
@@ -416,7 +418,7 @@ def layers_figure(table: "pd.DataFrame") -> "Figure":
         value=table["lift"],
     )
     label = "attention per area on the target"
-    look = dict(panel="panel", series="query", label=label, scale=1.0, top=None)
+    look: dict[str, Any] = dict(panel="panel", series="query", label=label, scale=1.0, top=None)
     return charts.curves(shown, "layer", label_x="layer", **look)
 
 
@@ -430,7 +432,7 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
             won = line[f"{name}, success"]
             about = {"of": f"{line['suite']}, {line['method']}", "localisation": name}
             lines.append({**about, "n": line["n"], "success": won, "failure": line[name] - won})
-    look = dict(group="of", label="% of episodes (in the bars: how many)")
+    look: dict[str, Any] = dict(group="of", label="% of episodes (in the bars: how many)")
     return charts.stacked(pd.DataFrame(lines), "localisation", ["success", "failure"], **look)
 
 
@@ -463,5 +465,7 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
         ]
         titles[method] = f"{method}: of episodes that touch something\n{', '.join(told)}"
     lines["method"] = lines["method"].map(titles)
-    look = dict(panel="method", series="ends", label="peak on the target, %", dashed=["chance"])
+    look: dict[str, Any] = dict(
+        panel="method", series="ends", label="peak on the target, %", dashed=["chance"]
+    )
     return charts.curves(lines, "left", label_x="calls before the first touch", **look)

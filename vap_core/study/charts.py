@@ -98,8 +98,10 @@ def _finish(figure: "Figure", title: str = "", columns: int = 4) -> "Figure":
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(name, handle)
     if handles:
-        where = dict(loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
-        figure.legend(handles.values(), handles.keys(), **where)
+        where: dict[str, Any] = dict(
+            loc="outside lower center", ncols=columns, frameon=False, fontsize=8
+        )
+        figure.legend(list(handles.values()), list(handles), **where)
     if title:
         figure.suptitle(title, fontsize=11, fontweight="bold")
     return figure
@@ -173,7 +175,9 @@ def dots(
                     scale * end + 2, y, f"{scale * row['value']:.0f}", va="center", fontsize=8
                 )
             if row.get("paper", np.nan) == row.get("paper", np.nan):
-                look = dict(color=PAPER, fillstyle="none", markersize=5, label="the paper's")
+                look: dict[str, Any] = dict(
+                    color=PAPER, fillstyle="none", markersize=5, label="the paper's"
+                )
                 axes.plot(scale * row["paper"], y, "D", **look)
         shown = ["" if i in bold else name for i, name in enumerate(labels)]
         axes.set_yticks(range(len(labels)), shown, fontsize=8)
@@ -227,16 +231,16 @@ def curves(
             if rows.empty:
                 continue
             at = np.array([places.index(each) for each in rows[x]] if words else rows[x], float)
-            look = dict(color=colours[name] if series else PLAIN, linewidth=1.5)
+            look: dict[str, Any] = dict(color=colours[name] if series else PLAIN, linewidth=1.5)
             style = "--" if name in dashed else "-"
-            few = dict(marker=POLICY_MARKERS[i % len(POLICY_MARKERS)], markersize=4)
+            few: dict[str, Any] = dict(marker=POLICY_MARKERS[i % len(POLICY_MARKERS)], markersize=4)
             look |= few if len(rows) <= 24 else {}
             axes.plot(at, scale * rows["value"], style, label=name or None, **look)
             if "low" in rows:
                 ends = scale * rows["low"], scale * rows["high"]
                 axes.fill_between(at, *ends, color=look["color"], alpha=0.15, linewidth=0)
             if "paper" in rows and rows["paper"].notna().any():
-                theirs = dict(color=PAPER, fillstyle="none", label="the paper's")
+                theirs: dict[str, Any] = dict(color=PAPER, fillstyle="none", label="the paper's")
                 axes.plot(at, scale * rows["paper"], "D--", **theirs)
         if words:
             axes.set_xticks(range(len(places)), places, fontsize=8, rotation=20)
@@ -274,10 +278,12 @@ def bars(
             rows = part[part[series].astype(str) == name] if series else part
             at = np.array([own.index(group) for group in rows[x].astype(str)], float)
             at += (i - (len(names) - 1) / 2) * 0.84 / len(names)
-            look = dict(color=colours[name] if series else PLAIN, label=name or None)
+            look: dict[str, Any] = dict(
+                color=colours[name] if series else PLAIN, label=name or None
+            )
             axes.bar(at, 100 * rows["value"], 0.76 / len(names), **look)
             ends = _ends(rows.to_dict("records"))
-            bound = dict(fmt="none", ecolor="black", capsize=2, linewidth=0.9)
+            bound: dict[str, Any] = dict(fmt="none", ecolor="black", capsize=2, linewidth=0.9)
             axes.errorbar(at, 100 * rows["value"], yerr=ends, **bound)
             if "paper" in rows:
                 axes.plot(at, 100 * rows["paper"], "D", color=PAPER, fillstyle="none")
@@ -317,7 +323,7 @@ def stacked(
                           label=MEANINGS.get(part, part))  # fmt: skip
         counts = [str(n) if wide > 2 else "" for n, wide in zip(table[part], percent, strict=True)]
         dark = np.dot(to_rgb(colour), (0.3, 0.59, 0.11)) < 0.5
-        ink = dict(color="white" if dark else "black", fontsize=7.5)
+        ink: dict[str, Any] = dict(color="white" if dark else "black", fontsize=7.5)
         axes.bar_label(drawn, counts, label_type="center", **ink)
         start += percent
     axes.set_yticks(range(len(labels)), labels, fontsize=8)
@@ -384,7 +390,7 @@ def sheet(
     axes.set_axis_off()
     for i, (label, row) in enumerate(rows.items()):
         left, top = i // per_column * width, i % per_column * height + 0.03
-        middle = dict(ha="right", va="center", fontsize=9)
+        middle: dict[str, Any] = dict(ha="right", va="center", fontsize=9)
         axes.text(left + label_in - 0.08, top + side_in / 2, label, **middle)
         for j, tile in enumerate(row):
             x, y = left + label_in + (j + 0.5) * side_in, top + side_in / 2
@@ -394,9 +400,9 @@ def sheet(
             axes.imshow(tile.picture, extent=extent, aspect="auto", interpolation="antialiased")
             if tile.edge:
                 corner = (x - half, y - half)
-                frame = dict(fill=False, edgecolor=tile.edge, linewidth=1.8)
+                frame: dict[str, Any] = dict(fill=False, edgecolor=tile.edge, linewidth=1.8)
                 axes.add_patch(Rectangle(corner, 2 * half, 2 * half, **frame))
-            below = dict(ha="center", va="top", fontsize=title_pt, color=TEXT)
+            below: dict[str, Any] = dict(ha="center", va="top", fontsize=title_pt, color=TEXT)
             axes.text(x, top + side_in, tile.title, **below)
     axes.set(xlim=(0, columns * width), ylim=(per_column * height, 0))
     return figure

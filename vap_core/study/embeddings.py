@@ -180,7 +180,7 @@ def paper_spaces() -> "pd.DataFrame":
     table = table[table.table == "embedding_comparison"]
     rows = []
     for policy, part in table.groupby("row", sort=False):
-        values = dict(zip(part.metric, part.value.astype(float), strict=True))
+        values: dict[str, Any] = dict(zip(part.metric, part.value.astype(float), strict=True))
         row: dict[str, Any] = {"policy": policy, "group": WHOLE}
         row["tokens"] = int(values["vocabulary"])
         for name, metric in MEASURES.items():

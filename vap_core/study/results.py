@@ -704,11 +704,11 @@ def command_line(study: dict[str, Any]) -> str:
     for method in study["methods"]:
         words += ["--method", method]
     options = ["episodes", "seed", "policy", "stack", "robots", "object", "split", "temperature"]
-    given = {name: study.get(name) for name in options}
+    asked = {name: study.get(name) for name in options}
     if whole:
-        given["seeds"] = study["seeds"] if study.get("seeds", 1) > 1 else None
-        given["follow"] = study.get("follow")
-    for name, setting in given.items():
+        asked["seeds"] = study["seeds"] if study.get("seeds", 1) > 1 else None
+        asked["follow"] = study.get("follow")
+    for name, setting in asked.items():
         if setting is not None:
             words += [f"--{name}", str(setting)]
     if study.get("audit"):

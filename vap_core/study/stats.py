@@ -663,7 +663,9 @@ def abstentions(episodes: "pd.DataFrame") -> "pd.DataFrame":
         }
         for (suite, method, policy), present in groups.items():
             absent = groups.get((f"{suite}{ABSENT}", method, policy))
-            for threshold in THRESHOLDS if absent is not None else ():
+            if absent is None:
+                continue
+            for threshold in THRESHOLDS:
                 acting, without = (each[each["margin"] >= threshold] for each in (present, absent))
                 line = dict(suite=suite, method=method, policy=policy, threshold=threshold)
                 counts = (
