@@ -126,7 +126,9 @@ def dots(
     A mark per `series` has its own colour and marker, and per `policy` of a series another marker.
     """
     figure, panels = _panels(table, panel, (1.0, 1.0))
-    marks = method_marks(names_in(table, series)) if series else {"": (PLAIN, "o")}
+    names = names_in(table, series)
+    colours = colours_of(names) if series else {"": PLAIN}
+    marks = {name: (colours[name], mark) for name, (_, mark) in method_marks(names).items()}
     policies = names_in(table, policy)
     heights = []
     ticks: list[list[str]] = []
