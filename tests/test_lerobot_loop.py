@@ -104,7 +104,7 @@ def test_one_step_does_not_serve_two_tasks_at_a_time(bank):
     step = pipeline(bank)
     step(batch([at(4)], [0], text="bring my mug"))
     step(batch([at(20)], [0], text="bring my jar"))
-    with pytest.raises(BadViews, match="'bring my mug' at step 1, and was 'bring my jar'"):
+    with pytest.raises(BadViews, match="'bring my mug' at step 1, and had 'bring my jar'"):
         step(batch([at(6)], [1], text="bring my mug"))
     step(batch([at(22)], [1], text="bring my jar"))
     with pytest.raises(BadViews, match="at step 1 twice, with another picture"):

@@ -1,7 +1,7 @@
 """The stacks by name, mixed stacks, and what a stack of a caller's own is made of."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,10 +23,8 @@ def describe_parts(make: Callable[[], Stack]) -> dict[str, Any]:
     dictionaries, a network's weights, what a closure or a partial holds.
     """
     stack = make()
-    about: dict[str, Any] = {"made by": source_digest(make), "encoder name": stack.encoder.name}
-    for field in fields(stack):
-        about[field.name] = _describe(getattr(stack, field.name), ())
-    return about
+    parts = {field.name: _describe(getattr(stack, field.name), ()) for field in fields(stack)}
+    return {"made by": source_digest(make), "encoder name": stack.encoder.name, **parts}
 
 
 def _describe(part: Any, within: tuple[int, ...]) -> Any:
@@ -43,14 +41,17 @@ def _describe(part: Any, within: tuple[int, ...]) -> Any:
     within = (*within, id(part))
     if isinstance(part, list | tuple):
         return [_describe(each, within) for each in part if _counts(each)]
-    about = {
+    names: dict[str, None] = {}
+    if not isinstance(part, type):  # a class has no attributes of its own
+        names = dict.fromkeys(getattr(part, "__dict__", ()))
+        for kind in type(part).__mro__:
+            names |= dict.fromkeys(getattr(kind, "__slots__", ()))
+    values = {name: getattr(part, name, None) for name in names}
+    return {
         "kind": getattr(part, "__qualname__", type(part).__qualname__),
         "code": source_digest(part),
+        **{name: _describe(value, within) for name, value in values.items() if _counts(value)},
     }
-    for name, value in _attributes(part):
-        if _counts(value):
-            about[name] = _describe(value, within)
-    return about
 
 
 def _counts(value: Any) -> bool:
@@ -58,17 +59,6 @@ def _counts(value: Any) -> bool:
     if isinstance(value, str | int | float | np.generic | np.ndarray | list | tuple):
         return True
     return callable(value) or isinstance(value, Tracker) or is_dataclass(value)
-
-
-def _attributes(part: Any) -> Iterator[tuple[str, Any]]:
-    """The attributes of an object itself; a class has none."""
-    if isinstance(part, type):
-        return
-    names = dict.fromkeys(getattr(part, "__dict__", ()))
-    for kind in type(part).__mro__:
-        names |= dict.fromkeys(getattr(kind, "__slots__", ()))
-    for name in names:
-        yield name, getattr(part, name, None)
 
 
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.53, unfamiliar=0.54)

@@ -226,35 +226,33 @@ class VapPrompt(ProcessorStep):
 
     def _follow(self, i: int, step: int, images: Views, text: str) -> OngoingEpisode:
         """The episode of environment `i` after its next images."""
-        episode = self._ongoing.get(i)
+        episode, fault = self._ongoing.get(i), ""
         if step == 0:
             state, attended = self._load().start(images, text, objects=self.objects)
         elif episode is None or step not in (episode.step, episode.step + 1):
             last = "nothing" if episode is None else episode.step
-            raise BadViews(
-                f"VapPrompt: environment {i} is at step {step} after {last}; give every picture, "
-                "in order."
-            )
+            fault = f"is at step {step} after {last}; give every picture, in order"
         elif text != episode.given[1]:
-            raise BadViews(
-                f"VapPrompt: the task of environment {i} is {text!r} at step {step}, and was "
-                f"{episode.given[1]!r}; begin an episode with it, and let one step serve one task "
-                "at a time."
+            fault = (
+                f"has the task {text!r} at step {step}, and had {episode.given[1]!r}; begin an "
+                "episode with it, and let one step serve one task at a time"
             )
         elif images.keys() != episode.given[0].keys():
-            raise BadViews(
-                f"VapPrompt: views of {sorted(images)}, but the episode started with "
-                f"{sorted(episode.given[0])}; give the same cameras."
+            fault = (
+                f"has views of {sorted(images)}, but the episode started with "
+                f"{sorted(episode.given[0])}; give the same cameras"
             )
         elif step == episode.step:
-            if any((rgb != episode.given[0][camera]).any() for camera, rgb in images.items()):
-                raise BadViews(
-                    f"VapPrompt: environment {i} is at step {step} twice, with another picture; "
-                    "number its steps, and let one step serve one environment."
-                )
-            return episode  # it is over, and stands still until the others are done
+            if not any((rgb != episode.given[0][camera]).any() for camera, rgb in images.items()):
+                return episode  # it is over, and stands still until the others are done
+            fault = (
+                f"is at step {step} twice, with another picture; number its steps, and let one "
+                "step serve one environment"
+            )
         else:
             state, attended = self._load().step(episode.state, images)
+        if fault:
+            raise BadViews(f"VapPrompt: environment {i} {fault}.")
         return OngoingEpisode(step, (images, text), state, attended.images, attended.text)
 
     def _load(self) -> Attender:
