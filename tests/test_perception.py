@@ -15,14 +15,13 @@ from vap_core.base.types import Boxes
 from vap_core.contracts.given import noise, rendered_scene
 from vap_core.perception import text_encoder as text
 from vap_core.perception.boxes import MAX_BOXES, NMS_IOU, box_iou, crop, suppress_overlaps
+from vap_core.perception.embedded import cells, networks
 from vap_core.perception.embedded import encoder as embed
-from vap_core.perception.embedded import networks
 from vap_core.perception.embedded import proposer as detect
 from vap_core.perception.embedded import segmenter as segment
 from vap_core.perception.embedded import tracker as track
-from vap_core.perception.embedded.tracker import cells
-from vap_core.perception.embedded.tracker.cells import argmax_planes
-from vap_core.perception.embedded.tracker.identities import RECENT
+from vap_core.perception.embedded.cells import argmax_planes
+from vap_core.perception.embedded.identities import RECENT
 from vap_make.perception import backbone as features
 
 

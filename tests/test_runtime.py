@@ -14,9 +14,8 @@ from tests.command import process
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import Boxes
 from vap_core.perception.boxes import crop, mask_iou
-from vap_core.perception.embedded import encoder, networks, proposer, segmenter, tracker
+from vap_core.perception.embedded import cells, encoder, networks, proposer, segmenter, tracker
 from vap_core.perception.embedded.networks import FOLDER, MANIFEST, PERCEPTION, load_weights
-from vap_core.perception.embedded.tracker import cells
 from vap_make.perception import graphs
 from vap_make.perception.backbone import TorchNetwork
 

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from vap_core.base.types import Track
 from vap_core.perception.boxes import mask_iou
+from vap_core.perception.embedded import cells, identities
 from vap_core.perception.embedded import tracker as track
-from vap_core.perception.embedded.tracker import cells, identities
 
 RED, BLUE, TEAL = (200, 40, 40), (40, 60, 200), (20, 150, 140)
 SIZE = 128

@@ -101,7 +101,7 @@ def in_brackets(found: tuple[float, float, float]) -> str:
 
 # Parts of the running code. Where a function moves, mend these tables; a test resolves every name.
 
-TRACKER = "vap_core.perception.embedded.tracker.tracker:"
+TRACKER = "vap_core.perception.embedded.tracker:"
 PI0 = "lerobot.policies.pi0.modeling_pi0:"
 ENV = "vap_core.simulation.env:Env."
 RENDERER = "vap_core.simulation.cameras:Renderer."

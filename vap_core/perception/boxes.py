@@ -5,7 +5,6 @@ Boxes are `x0 y0 x1 y1` in pixels, far corner exclusive.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 
 import cv2
 import numpy as np
@@ -126,10 +125,8 @@ class TiledDetector:
         found = []
         for image in images:
             corners = tile_corners(image.shape[0], image.shape[1])
-            parts = [image]
-            for x0, y0, x1, y1 in corners.tolist():
-                parts.append(image[y0:y1, x0:x1])
-            whole, *of_tiles = self.detector(parts, phrase, threshold)
+            tiles = [image[y0:y1, x0:x1] for x0, y0, x1, y1 in corners.tolist()]
+            whole, *of_tiles = self.detector([image, *tiles], phrase, threshold)
             kept = [whole]
             for corner, boxes in zip(corners, of_tiles, strict=True):
                 uncut = ~_cut_by_edge(boxes.xyxy, corner, image.shape[1], image.shape[0])
@@ -143,12 +140,9 @@ class TiledDetector:
 def tile_corners(height: int, width: int) -> Int64[np.ndarray, "9 4"]:
     """Half-size tiles on a 3 x 3 grid, x0 y0 x1 y1."""
     tall, wide = -(-height // 2), -(-width // 2)
-    corners = []
-    for row, column in product(range(GRID), range(GRID)):
-        y = (height - tall) * row // (GRID - 1)
-        x = (width - wide) * column // (GRID - 1)
-        corners.append([x, y, x + wide, y + tall])
-    return np.array(corners, np.int64)
+    tops = [(height - tall) * row // (GRID - 1) for row in range(GRID)]
+    lefts = [(width - wide) * column // (GRID - 1) for column in range(GRID)]
+    return np.array([[x, y, x + wide, y + tall] for y in tops for x in lefts], np.int64)
 
 
 def _cut_by_edge(

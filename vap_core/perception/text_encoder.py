@@ -37,17 +37,8 @@ def embed_text(phrases: Sequence[str]) -> Float32[np.ndarray, "n 384"]:
 
     Raises: MissingWeights: the text encoder is not on this machine and cannot be fetched.
     """
-    rows = np.zeros((len(phrases), WIDTH), np.float32)
-    for row, phrase in zip(rows, phrases, strict=True):
-        row[:] = _cached_embedding(" ".join(phrase.lower().split()))
-    return rows
-
-
-@cache
-def _cached_embedding(phrase: str) -> Float32[np.ndarray, "384"]:
-    row = _embed(phrase)
-    row.setflags(write=False)
-    return row
+    rows = [_embed(" ".join(phrase.lower().split())) for phrase in phrases]
+    return np.array(rows, np.float32).reshape(-1, WIDTH)
 
 
 @cache
@@ -109,6 +100,7 @@ def _fetch_model() -> Path:
     return store_folder() / MODELS[TEXT].folder
 
 
+@cache
 def _embed(phrase: str) -> Float32[np.ndarray, "384"]:
     """One phrase through six post-norm transformer layers; the mean over its tokens, normalised."""
     tokenizer, weights = _load_model()

@@ -15,7 +15,8 @@ from torch.nn import functional as F  # noqa: N812
 
 from vap_core.base.errors import MissingWeights
 from vap_core.base.types import value
-from vap_core.perception.embedded import encoder, proposer, segmenter
+from vap_core.perception.embedded import cells, encoder, proposer, segmenter
+from vap_core.perception.embedded.cells import TAP
 from vap_core.perception.embedded.encoder import HISTOGRAM_LENGTH, INSTANCE_TAPS, INSTANCE_WIDTH
 from vap_core.perception.embedded.networks import (
     CHANNELS,
@@ -25,8 +26,6 @@ from vap_core.perception.embedded.networks import (
 )
 from vap_core.perception.embedded.proposer import TAPS
 from vap_core.perception.embedded.segmenter import MASK_TAPS
-from vap_core.perception.embedded.tracker import cells
-from vap_core.perception.embedded.tracker.cells import TAP
 from vap_core.perception.text_encoder import WIDTH as TEXT_WIDTH
 from vap_make.perception.backbone import Trunk, normalise, write_entry
 

@@ -82,10 +82,7 @@ class LiteEncoder:
             self.name += "-stretched"
 
     def __call__(self, crops: Sequence[Rgb]) -> Float32[np.ndarray, "n d"]:
-        rows = np.zeros((len(crops), self.dim), np.float32)
-        for row, rgb in zip(rows, crops, strict=True):
-            row[:] = self._embed(rgb)
-        return rows
+        return np.array([self._embed(rgb) for rgb in crops], np.float32).reshape(-1, self.dim)
 
     def _embed(self, rgb: Rgb) -> Float32[np.ndarray, " d"]:
         if self.stretch:

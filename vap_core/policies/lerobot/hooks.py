@@ -5,11 +5,12 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
 from vap_core.base.types import value
-from vap_core.policies.protocol import ACTION, AttentionMap, Phrases, report_attention
+from vap_core.policies.protocol import ACTION, Phrases, report_attention
 
 Positions = dict[str, list[int]]
 """The places of every query's tokens, by query."""
@@ -200,18 +201,14 @@ class Watch:
                 layers = self._words[episode, query]
                 queries[query] = torch.stack([layers[layer] for layer in sorted(layers)])
             queries[ACTION] = torch.stack(of_actions)[:, episode]
-            by_camera: dict[str, dict[str, AttentionMap]] = {}
-            for query, attended in queries.items():
-                for camera, heat in zip(self.layout.cameras, self._maps(attended), strict=True):
-                    by_camera.setdefault(camera, {})[query] = heat
-            for camera, maps in by_camera.items():
-                report_attention(episode, camera, maps)
-
-    def _maps(self, attended: Float[torch.Tensor, "layers heads _"]) -> list[AttentionMap]:
-        """One map per camera."""
-        side = self.layout.side
-        maps = attended.unflatten(2, (len(self.layout.cameras), side, side))
-        return list(maps.permute(2, 0, 1, 3, 4).float().cpu().numpy())
+            cameras, side = self.layout.cameras, self.layout.side
+            maps = {
+                query: attended.unflatten(2, (len(cameras), side, side)).float().cpu().numpy()
+                for query, attended in queries.items()
+            }
+            for i, camera in enumerate(cameras):
+                of_camera = {query: np.ascontiguousarray(m[:, :, i]) for query, m in maps.items()}
+                report_attention(episode, camera, of_camera)
 
 
 @contextmanager

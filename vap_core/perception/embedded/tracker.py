@@ -11,6 +11,7 @@ them, the cells and the appearance of t = 0 are remembered.
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
@@ -18,9 +19,9 @@ from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Mask, Rgb, Track
 from vap_core.perception.boxes import mask_box
-from vap_core.perception.embedded.networks import Network
-from vap_core.perception.embedded.segmenter import LiteSegmenter
-from vap_core.perception.embedded.tracker.cells import (
+from vap_core.perception.embedded.cells import (
+    GRAPH,
+    TAP,
     Labels,
     argmax_planes,
     cells_near,
@@ -29,7 +30,8 @@ from vap_core.perception.embedded.tracker.cells import (
     propagate,
     to_pixels,
 )
-from vap_core.perception.embedded.tracker.identities import (
+from vap_core.perception.embedded.encoder import load as load_encoder
+from vap_core.perception.embedded.identities import (
     FrameFeatures,
     TrackState,
     changed_nearby,
@@ -40,6 +42,15 @@ from vap_core.perception.embedded.tracker.identities import (
     tracks_of,
     update_state,
 )
+from vap_core.perception.embedded.networks import (
+    PERCEPTION,
+    Network,
+    load_network,
+    read_manifest,
+    trunk_weights,
+)
+from vap_core.perception.embedded.segmenter import LiteSegmenter
+from vap_core.perception.embedded.segmenter import load as load_segmenter
 from vap_core.perception.protocols import Encoder
 
 FIRST_FRAME_WEIGHT = 0.4
@@ -94,13 +105,8 @@ class LiteTracker:
     def step(
         self, states: Sequence[TrackState], images: Sequence[Rgb]
     ) -> tuple[list[TrackState], list[tuple[Track, ...]]]:
-        new_states: list[TrackState] = []
-        tracks: list[tuple[Track, ...]] = []
-        for state, image in zip(states, images, strict=True):
-            new_state = self._step(state, image)
-            new_states.append(new_state)
-            tracks.append(tracks_of(new_state))
-        return new_states, tracks
+        after = [self._step(*pair) for pair in zip(states, images, strict=True)]
+        return after, [tracks_of(state) for state in after]
 
     def _step(self, state: TrackState, image: Rgb) -> TrackState:
         thumbnail = thumbnail_of(image)
@@ -117,20 +123,9 @@ class LiteTracker:
         for i in lost:
             if is_due(int(state.lost[i])):
                 state, absence[i] = search(
-                    state=state,
-                    frame=frame,
-                    probability=probability,
-                    identity=int(i),
-                    segmenter=self.segmenter,
-                    encoder=self.encoder,
+                    state, frame, probability, int(i), self.segmenter, self.encoder
                 )
-        return update_state(
-            state=state,
-            frame=frame,
-            probability=probability,
-            judged=np.union1d(moving, lost),
-            absence=absence,
-        )
+        return update_state(state, frame, probability, np.union1d(moving, lost), absence)
 
     def _redraw(
         self,
@@ -147,10 +142,7 @@ class LiteTracker:
             guess = nearest_component(owner == i + 1, share, state.boxes[i])
             if guess is None:
                 guess = nearest_component(share > MIN_SHARE, share, state.boxes[i])
-            if guess is None:
-                probability[i] = 0
-            else:
-                probability[i] = self._draw(frame.image, share, guess)
+            probability[i] = 0 if guess is None else self._draw(frame.image, share, guess)
 
     def _draw(
         self, image: Rgb, share: Float32[np.ndarray, "h w"], guess: Mask
@@ -177,3 +169,14 @@ def _propagate(state: TrackState, frame: FrameFeatures, moving: Int64[np.ndarray
     by_first = propagate(frame.keys, [state.first], frame.grid, local=False, selected=near)
     by_recent = propagate(frame.keys, recent, frame.grid, local=True, selected=near)
     return FIRST_FRAME_WEIGHT * by_first + (1 - FIRST_FRAME_WEIGHT) * by_recent
+
+
+@cache
+def load() -> LiteTracker:
+    """The shipped tracker, with the shipped segmenter and encoder.
+
+    Raises: MissingWeights: a file of data/weights is absent or damaged.
+    """
+    sha256 = read_manifest()[PERCEPTION]["sha256"]
+    network = load_network(GRAPH, trunk_weights([TAP]), sha256)
+    return LiteTracker(network, load_segmenter(), load_encoder())

@@ -12,9 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Mask, Rgb, Track, value
 from vap_core.perception.boxes import crop, mask_box, mask_iou
-from vap_core.perception.embedded.networks import Network
-from vap_core.perception.embedded.segmenter import LiteSegmenter, box_plane
-from vap_core.perception.embedded.tracker.cells import (
+from vap_core.perception.embedded.cells import (
     N_BINS,
     Appearances,
     FrameMemory,
@@ -32,6 +30,8 @@ from vap_core.perception.embedded.tracker.cells import (
     to_cells,
     to_pixels,
 )
+from vap_core.perception.embedded.networks import Network
+from vap_core.perception.embedded.segmenter import LiteSegmenter, box_plane
 from vap_core.perception.protocols import Encoder
 
 RECENT = 3
