@@ -201,12 +201,12 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
         "K = 7, average",
         "simpler-fractal head",
         "x encoder pass",
-        "left out: simpler-fractal 0 of 2",
+        "left out: simpler-fractal 0 of 4",
     ):
         assert told in done.stdout
     tables = read(out, Survey.caller, survey.TABLES)
-    assert len(tables["views"]) == 2
-    assert len(tables["choices"]) == 2 * 4 * 2
+    assert len(tables["views"]) == 4
+    assert len(tables["choices"]) == 4 * 4 * 2
     assert set(tables["tracks"].hidden) == {0, 3}
     assert len(tables["references"]) == 2 * 4
     measured = {
@@ -215,7 +215,7 @@ def test_the_command_measures_resumes_and_publishes(tmp_path: Path) -> None:
     }
     assert (
         sum((measured[f"right instance, {tier}"] or {"n": 0})["n"] for tier in ("standard", "hard"))
-        == 2
+        == 4
     )
     held = json.loads(read_schema(tmp_path / "kept" / "perception_views.parquet").metadata[b"run"])
     assert set(held["configuration"]) >= {
