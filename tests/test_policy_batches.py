@@ -295,15 +295,10 @@ def test_one_batch_can_be_learned_by_heart(stage: tuple[Path, list[Film]]) -> No
     assert late["hit"] > early["hit"]
 
 
-@pytest.mark.parametrize(
-    ("shown", "rms", "most"), [("bridge", 0.14, 0.52), ("fractal", 0.16, 0.58)]
-)
-def test_how_far_the_planned_turn_is_from_the_one_that_was_made(
-    shown: str, rms: float, most: float
-) -> None:
+def test_how_far_the_planned_turn_is_from_the_one_that_was_made() -> None:
     """Knocks that follow are not in the plan that `turn_otherwise` adds."""
     off = []
-    for path in sorted((DATA / "demonstrations" / f"simpler-{shown}" / "data").rglob("*.parquet")):
+    for path in sorted((DATA / "demonstrations" / "simpler-bridge" / "data").rglob("*.parquet")):
         for _, film in pd.read_parquet(path).groupby("episode_index"):
             state, action = np.stack(film["observation.state"]), np.stack(film["action"])
             for t in range(len(action)):
@@ -312,5 +307,5 @@ def test_how_far_the_planned_turn_is_from_the_one_that_was_made(
                     turned = state[t + close, SPIN_Z] - state[t, SPIN_Z]
                     off.append(action[t : t + close, SPIN_Z].sum() - turned)
     away = np.abs((np.array(off) + np.pi) % (2 * np.pi) - np.pi)
-    assert np.sqrt((away**2).mean()) == pytest.approx(rms, abs=0.005)
-    assert away.max() == pytest.approx(most, abs=0.005)
+    assert np.sqrt((away**2).mean()) == pytest.approx(0.14, abs=0.005)
+    assert away.max() == pytest.approx(0.52, abs=0.005)
