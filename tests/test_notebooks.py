@@ -113,6 +113,26 @@ def test_make_lab_serves_every_picture_and_link_of_a_notebook(tmp_path: Path) ->
             process.terminate()
 
 
+def test_a_notebook_finds_the_repository_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Notebook 02, run from elsewhere, showed another survey in silence."""
+    for path, notebook in READ.items():
+        code = "".join("".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code")
+        assert "Path.cwd" not in code, path.name
+        assert "from vap_core import WORKSPACE as ROOT" in code, path.name
+    where = "import vap_core; print(vap_core.WORKSPACE)"
+    done = subprocess.run(
+        [sys.executable, "-c", where],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(done.stdout.strip()) == ROOT
+
+
 def test_the_map_holds_every_notebook() -> None:
     table = markdown(FILES[0])[notebook_links.MAP_ID]
     for path, title in TITLES.items():

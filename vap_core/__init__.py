@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vap_core.attend import Attender as Attender
     from vap_core.attend import Prompting as Prompting
     from vap_core.base.errors import VapError as VapError
+    from vap_core.base.files import WORKSPACE as WORKSPACE
     from vap_core.base.media import load_photo as load_photo
     from vap_core.base.media import photos_in as photos_in
     from vap_core.instruction import parse as parse
@@ -71,6 +72,7 @@ _load, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "attend": ["Attender", "Prompting"],
         "base.errors": ["VapError"],
+        "base.files": ["WORKSPACE"],
         "base.media": ["load_photo", "photos_in"],
         "study.diagnosis": ["diagnose"],
         "study.methods": ["METHODS"],
