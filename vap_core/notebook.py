@@ -150,7 +150,7 @@ def hardness(stage: Stage, encoder: Encoder) -> "pd.DataFrame":
         own = embedded(personal, QUERIES) @ references.T
         for model in lookalikes_by_tier(stem):
             cosines = embedded(model.name, QUERIES) @ references.T
-            line = {"object": stem.replace("-", " "), "lookalike": model.name}
+            line: dict[str, Any] = {"object": stem.replace("-", " "), "lookalike": model.name}
             line |= {"tier": tier(model), "cosine": float(cosines.mean())}
             wins = cosines[:, None] > own[None]
             lines.append({**line, "own": float(own.mean()), "fooled": float(wins.mean())})

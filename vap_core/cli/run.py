@@ -310,7 +310,8 @@ def ablate(asked: AskedOfAblation) -> None:
     about = ABLATIONS[name]
     if about.policies and asked.policy is not None:
         raise BadStudy(f"ablate {name}: it compares policies of its own; leave --policy out.")
-    given = {"suite": asked.suite or list(about.suites), "methods": list(about.names)}
+    given: dict[str, Any] = {"suite": asked.suite or list(about.suites)}
+    given |= {"methods": list(about.names)}
     given["policy"] = next(iter(about.policies.values()), asked.policy)
     of_study = {field: getattr(asked, field) for field in ("episodes", "seeds", "split")}
     study = study_of(AskedOfAll(**given, **of_study))

@@ -188,7 +188,9 @@ def ablation_table(episodes: "pd.DataFrame", *suites: str) -> "pd.DataFrame":
     tables = [pd.DataFrame(columns=["ablation", *COLUMNS, "paper_difference"])]
     for name, ablation in ABLATIONS.items():
         wanted = episodes["suite"].isin(suites or ablation.suites)
-        arms = arm_table(ablation, episodes[wanted]) if not ablation.policies else ()
+        if ablation.policies:
+            continue
+        arms = arm_table(ablation, episodes[wanted])
         if len(arms):
             arms.insert(0, "ablation", name)
             tables.append(arms)

@@ -20,7 +20,7 @@ from functools import cache
 from itertools import combinations
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import cv2
 import numpy as np
@@ -389,12 +389,14 @@ def _ground(
         elected["likeness"] = float(grounding.likeness[chosen])
         elected["chosen_iou"] = float(overlap[chosen])
         elected["margin"] = grounding.ballot.margin
-    compared = chosen is not None and candidates.verified is not None
+    points = None
+    if chosen is not None and candidates.verified is not None:
+        points = int(candidates.verified[chosen])
     return {
         "candidates": len(overlap),
         "proposed_iou": float(overlap.max(initial=0.0)),
         "tinted": grounding.winner is not None,
-        "verified": int(candidates.verified[chosen]) if compared else None,
+        "verified": points,
         "familiar": candidates.familiar,
         "iou": 0.0 if grounding.winner is None else float(overlap[grounding.winner]),
         "ms": round(1000 * seconds, 1),
@@ -696,7 +698,7 @@ def scene_table(table: "pd.DataFrame") -> "pd.DataFrame":
         "- none of its kind": ~seen & ~beside,
     }
     measures = ["proposed", "right", "right at IoU .25", "wrong tinted", "silent", "not in view"]
-    lines = []
+    lines: list[dict[str, Any]] = []
     for name, chosen in kinds.items():
         cells = dict.fromkeys(measures, "")
         for each in measures if len(lines) < 3 else ("wrong tinted", "silent"):
@@ -802,7 +804,7 @@ def evidence(row: Mapping[Any, Any]) -> str:
     return f"{overlap}, likeness {row['likeness']:.2f}"
 
 
-TABLE = "questions"
+TABLE: Final = "questions"
 """The table of what was asked."""
 Kind = Literal["questions", "masks", "clips", "single"]
 

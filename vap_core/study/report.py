@@ -88,7 +88,8 @@ def suites_table() -> str:
             listed = suites.rows(name, task.name)
             rules = " and ".join(listed[0].at(stage).rule for stage in range(listed[0].stages))
             counts = Counter(row.split for row in listed).values()
-            line = {"suite": name, "task": task.name, "instruction": task.instruction}
+            line: dict[str, Any] = {"suite": name, "task": task.name}
+            line["instruction"] = task.instruction
             line |= {"success when": rules, "max steps": task.max_steps}
             tasks.append({**line, "episodes": " + ".join(map(str, counts))})
     development = [
@@ -104,7 +105,7 @@ def suites_table() -> str:
             f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of "
             f"{suite.tasks[0].max_steps} steps, any number of episodes"
         )
-    return "\n\n".join([*map(_lines, (tracks, tasks)), "\n".join(notes)])
+    return "\n\n".join([_lines(tracks), _lines(tasks), "\n".join(notes)])
 
 
 def _lines(lines: Sequence[Mapping[str, Any]]) -> str:

@@ -171,6 +171,7 @@ def _catalogue() -> dict[str, ObjectModel]:
         texture = Texture(**{**paint, **colours})
         solids = []
         for kind, size, pos, *turned in row["solids"]:
+            axis: Any
             axis, euler = turned or ("z", (0, 0, 0))
             solids.append(Solid(kind, tuple(size), tuple(pos), axis, tuple(euler)))
         mesh_at = (*row["mesh"],)
