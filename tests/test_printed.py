@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from tests.command import refused, vap
 from vap_core.base.errors import printable
-from vap_core.base.files import align, csv_bytes, csv_cell, markdown
 from vap_core.cli import Terminal
+from vap_core.study.table import printed
 
 RESULTS = Path(__file__).resolve().parents[1] / "data" / "results"
 ESCAPES = (
@@ -41,8 +41,9 @@ def test_a_terminal_gets_no_commands_of_a_file(text: str) -> None:
         shown = stream.getvalue()
         assert shown == f"before {printable(text)} after\n"
         assert not set(shown) & set("\x1b\x07\x9b\x08\u202e\x00\r")
-    for rows in (align([["name"], [text]]), markdown([["name"], [text]])):
-        assert printable(text, "") in rows
+    for style in ("text", "markdown", "html", "csv"):
+        shown = printed([["name"], [text]], style)
+        assert not set(shown) & set("\x1b\x07\x9b\x08\u202e\x00\r") or style == "csv"
 
 
 def test_the_bars_of_long_work_still_move() -> None:
@@ -56,17 +57,16 @@ def test_the_bars_of_long_work_still_move() -> None:
 
 
 def test_text_in_a_table_of_markdown_is_no_html() -> None:
-    table = markdown([["a|b"], ["<img src=x onerror=alert(1)> & <b>"]])
+    table = printed([["a|b"], ["<img src=x onerror=alert(1)> & <b>"]], "markdown")
     assert "<img" not in table
     assert "&lt;img src=x onerror=alert(1)&gt; &amp; &lt;b&gt;" in table
 
 
 @pytest.mark.parametrize(
-    "text", ["=1+1", "+1", "-2", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")']
+    "text", ["=1+1", "+A1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")']
 )
 def test_text_in_a_csv_file_is_no_formula(text: str) -> None:
-    assert csv_cell(text) == f"'{text}"
-    written = csv_bytes(pd.DataFrame({"text": [text], "number": [-2.5]})).decode()
+    written = printed(pd.DataFrame({"text": [text], "number": [-2.5]}), "csv")
     assert written.splitlines()[0] == "text,number"
     assert written.split("\n", 1)[1].lstrip('"').startswith("'")
     assert written.rstrip().endswith("-2.5")

@@ -237,6 +237,8 @@ def test_an_unfinished_run_is_reported_as_it_is(tmp_path: Path) -> None:
         f"**Unfinished**: {folder} is unfinished: 18 of 24 episodes; run the same command again to "
         "finish it." in text
     )
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<strong>Unfinished</strong>: " in page
     lines = results(load_runs([folder])).set_index(["task", "method"])
     assert lines.loc["put-camera", "n"].tolist() == [3, 3]
     early = run(tmp_path / "early", keep=0.5)  # one task is not there at all

@@ -7,7 +7,6 @@ import csv
 import errno
 import fcntl
 import hashlib
-import html
 import inspect
 import json
 import os
@@ -26,7 +25,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from vap_core.base.errors import BadOutput, BadStudy, VapError, first_line, printable
+from vap_core.base.errors import BadOutput, BadStudy, VapError, first_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -333,33 +332,6 @@ def read_parquet(path: Path, caller: str, remedy: str) -> "pd.DataFrame":
     return read_arrow(path, caller, remedy).to_pandas()
 
 
-Rows = Sequence[Sequence[str]]
-"""The header first; every row has as many cells."""
-
-
-def align(rows: Rows) -> str:
-    """Plain text with aligned columns."""
-    return _render(rows, "simple")
-
-
-def markdown(rows: Rows) -> str:
-    """A pipe table that is aligned as plain text, too; text in it is no HTML."""
-    safe = [[html.escape(cell, quote=False).replace("|", "\\|") for cell in row] for row in rows]
-    return _render(safe, "github")
-
-
-def csv_cell(cell: object) -> object:
-    """A cell of a CSV file. A spreadsheet computes text that begins as a formula does."""
-    if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r")):
-        return f"'{cell}"
-    return cell
-
-
-def csv_bytes(table: "pd.DataFrame") -> bytes:
-    """A table as a CSV file, without its index. Text in it is no formula."""
-    return table.map(csv_cell).to_csv(index=False).encode()
-
-
 def signed(value: float, digits: int = 0) -> str:
     """A rounded number with its sign: "+3", "-0.4"; "+0" for all that rounds to zero."""
     return f"{value:+z.{digits}f}"
@@ -368,14 +340,6 @@ def signed(value: float, digits: int = 0) -> str:
 def signed_interval(middle: float, low: float, high: float, digits: int = 0) -> str:
     """A signed number and its interval: "+3 [-1, +7]"."""
     return f"{signed(middle, digits)} [{signed(low, digits)}, {signed(high, digits)}]"
-
-
-def _render(rows: Rows, style: str) -> str:
-    from tabulate import tabulate
-
-    safe = [[printable(cell, "") for cell in row] for row in rows]
-    text = tabulate(safe[1:], headers=safe[0], tablefmt=style, disable_numparse=True)
-    return "\n".join(line.rstrip() for line in text.splitlines())
 
 
 LONGEST, DEEPEST = 4_000, 40

@@ -74,8 +74,8 @@ def table(arms: Sequence[Arm], clock: str = "cpu") -> str:
     """Every arm: milliseconds, times the first of its axis with a 95 % interval, its parts."""
     import numpy as np
 
-    from vap_core.base.files import align
     from vap_core.study.stats import ratio
+    from vap_core.study.table import printed
 
     parts = list(dict.fromkeys(part for arm in arms for part in arm.costs[0].get("parts", ())))
     rows = [["", "", f"{clock} ms", "lowest .. highest", "times the first [95 %]", *parts]]
@@ -91,7 +91,7 @@ def table(arms: Sequence[Arm], clock: str = "cpu") -> str:
             of_part = [1e3 * cost["parts"].get(part, 0.0) / arm.n for cost in arm.costs]
             row.append(f"{np.median(of_part):.1f}" if any(of_part) else "-")
         rows.append(row)
-    return align(rows)
+    return printed(rows)
 
 
 def in_brackets(found: tuple[float, float, float]) -> str:
@@ -774,7 +774,7 @@ def commands() -> dict[str, list[str]]:
 
 def size() -> str:
     """How much there is to read: counts of vap_core and vap_make by folder, options, commands."""
-    from vap_core.base.files import align
+    from vap_core.study.table import printed
 
     root = Path(__file__).resolve().parents[2]
     found = count([root / name for name in ("vap_core", "vap_make") if (root / name).is_dir()])
@@ -785,7 +785,8 @@ def size() -> str:
     top = {name.split()[0] for name in listed}
     options = sum(map(len, listed.values()))
     return (
-        f"{align(rows)}\n\n{len(top)} commands at the top, {len(listed)} in all, {options} options"
+        f"{printed(rows)}\n\n{len(top)} commands at the top, {len(listed)} in all, "
+        f"{options} options"
     )
 
 

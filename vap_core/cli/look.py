@@ -154,8 +154,8 @@ def query(
     Example: python -m vap_core query data/runs/demo
         "select method, camera, avg(track_score) from steps group by method, camera"
     """
-    from vap_core.base.files import align
     from vap_core.study import steps
+    from vap_core.study.table import printed
 
     if question is None:
         joined, episodes = steps.read(run)
@@ -167,7 +167,7 @@ def query(
         rows = [["#", *found.columns]]
         rows += [[str(i), *map(str, line)] for i, line in enumerate(found.head(limit).values)]
         print(f"{len(found)} found")
-        print(align(rows))
+        print(printed(rows))
         return
     _check_viewer(png)
     path, frame = steps.recording_at(run, found, show or 0)

@@ -14,12 +14,13 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import align, make_folder, write_atomic, writing
+from vap_core.base.files import make_folder, write_atomic, writing
 from vap_core.base.types import value
 from vap_core.policies.mini_pi0.learned_token import model_of_policy
 from vap_core.policies.tables import open_table, token_groups
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study.paper import ledger
+from vap_core.study.table import printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -200,7 +201,7 @@ def report(table: "pd.DataFrame") -> str:
     note = f"{NOTE} {_compared(table)}"
     if len(left_out):
         note += f" Without rows of zeros, at most {left_out.without_direction.max()} a group."
-    return f"{align(rows)}\n\n{note}"
+    return f"{printed(rows)}\n\n{note}"
 
 
 def check_output(path: Path) -> None:
@@ -220,7 +221,7 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
     """Write the rows as Parquet or CSV, by the name's ending. Raises: BadOutput."""
     check_output(path)
     if path.suffix == ".csv":
-        data = table.to_csv(index=False).encode()
+        data = printed(table, "csv").encode()
     else:
         data = table.to_parquet(index=False, compression="zstd")
     with writing(path, "embeddings", "choose another --out"):

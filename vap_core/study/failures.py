@@ -70,7 +70,7 @@ def correct(folder: Path, row: Mapping[str, Any], text: str, note: str = "") -> 
     path = folder / FILE
     with writing(path, "correct", "copy the run to where you may write"):
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, table.to_csv(index=False).encode())
+        write_atomic(path, printed(table, "csv").encode())
     return path
 
 

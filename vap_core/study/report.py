@@ -273,7 +273,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
         "outcomes.csv": _csv(ends),
         "provenance.csv": _csv(origins),
         "report.html": report_page(
-            runs.table,
+            runs,
             {"Results": by_track, "Outcomes": {"": outcome_table(ends)}},
             figures["forest.png"],
             sources,
@@ -433,7 +433,7 @@ h3{font-size:14px;margin:6px 0 2px}.wide{overflow-x:auto}
 
 
 def report_page(
-    table: "pd.DataFrame",
+    runs: Runs,
     tables: "Mapping[str, Mapping[str, pd.DataFrame]]",
     forest: "Figure",
     sources: Sequence[Path],
@@ -441,9 +441,10 @@ def report_page(
 ) -> str:
     """The page that stands in the folder `out`.
 
-    `table` has one row per episode, `tables` are the report's by section and title; `sources` are
+    `tables` are the report's by section and title; `sources` are
     the runs, whose recordings give the pictures of failures.
     """
+    table = runs.table
     methods = ", ".join(dict.fromkeys(table["method"]))
     won = int(table["outcome"].eq("success").sum())
     about = f"{len(table)} episodes, {won} of them successes; methods: {methods}."
@@ -451,6 +452,7 @@ def report_page(
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Report</title>",
         f"<style>{STYLE}</style></head><body><h1>Report</h1>",
         f"<p>{escape(about)}</p>",
+        *(f"<p><strong>Unfinished</strong>: {escape(line)}</p>" for line in runs.unfinished),
         _picture(forest, "success rates with 95 % intervals"),
     ]
     for section, by_title in tables.items():

@@ -22,6 +22,7 @@ from vap_core.base.files import (
     write_atomic,
     writing,
 )
+from vap_core.study.table import printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -284,7 +285,7 @@ def write_tables(
         with writing(folder, caller):
             data = encode_table(arrow.replace_schema_metadata({b"run": about}))
             write_atomic(folder / f"{name}.parquet", data)
-            csv = arrow.to_pandas().round(4).to_csv(index=False)
+            csv = printed(arrow.to_pandas().round(4), "csv")
             write_atomic(folder / f"{name}.csv", csv.encode())
     return read_tables({name: folder / f"{name}.parquet" for name in tables}, caller)
 

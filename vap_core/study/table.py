@@ -39,7 +39,9 @@ def printed(table: "pd.DataFrame | Sequence[Sequence[str]]", style: Style = "tex
         lines = "".join(f"<tr>{''.join(row)}</tr>" for row in rows)
         return f"<div class='wide'><table>{lines}</table></div>"
     if style == "markdown":
-        head, *body = [[cell.replace("|", "\\|") for cell in row] for row in (head, *body)]
+        head, *body = [
+            [escape(cell, quote=False).replace("|", "\\|") for cell in row] for row in (head, *body)
+        ]
     form = {"text": "simple", "markdown": "github"}[style]
     text = tabulate(body, headers=head, tablefmt=form, disable_numparse=True)
     return "\n".join(line.rstrip() for line in text.splitlines())

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vap_core.base.files import Rows, align
 from vap_core.base.types import value
 from vap_core.perception.protocols import FamiliarityJudge, Stack, Thresholds
 from vap_core.study.stats import clustered_share
+from vap_core.study.table import printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,7 +80,7 @@ def text_report(table: "pd.DataFrame", chosen: Choice, stack: Stack) -> str:
                 f"is chosen; {more}."
             )
         if threshold is not None or current is not None:
-            lines.append(align(threshold_rows(part, threshold, current)))
+            lines.append(printed(threshold_rows(part, threshold, current)))
         parts.append("\n".join(lines))
     thresholds = chosen.thresholds(stack)
     if thresholds is not None:
@@ -88,7 +88,9 @@ def text_report(table: "pd.DataFrame", chosen: Choice, stack: Stack) -> str:
     return "\n\n".join([*parts, NOTE])
 
 
-def threshold_rows(part: "pd.DataFrame", chosen: float | None, current: float | None) -> Rows:
+def threshold_rows(
+    part: "pd.DataFrame", chosen: float | None, current: float | None
+) -> list[list[str]]:
     """A line per threshold around the chosen one, or the present one; then one per source."""
     rows = [
         ["threshold", "", "right refused", "tinted, in view", "tinted, look-alikes", "tinted, none"]

@@ -14,6 +14,7 @@ from vap_core.perception.stacks import checksums, is_own, load_stack, ships_thre
 from vap_core.study import store
 from vap_core.study.photos import TABLE, measure_photos
 from vap_core.study.store import read_json_part, write_json_part
+from vap_core.study.table import printed
 from vap_make.calibration.report import PRICE, Choice, choose, text_report
 from vap_make.calibration.scenes import SEED, Row, measure_scene
 
@@ -51,7 +52,7 @@ def calibrate(
         report = text_report(table, chosen, stack)
         with writing(out, "calibrate"):
             write_atomic(out / "report.txt", f"{report}\n".encode())
-            write_atomic(out / "answers.csv", table.round(4).to_csv(index=False).encode())
+            write_atomic(out / "answers.csv", printed(table.round(4), "csv").encode())
     return f"{report}\n\nwrote {out / 'report.txt'} and {out / 'answers.csv'}", chosen
 
 

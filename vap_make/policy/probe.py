@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
-from vap_core.base.files import align, make_folder, read_parquet, write_atomic
+from vap_core.base.files import make_folder, read_parquet, write_atomic
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.policies.protocol import label_of
@@ -30,6 +30,7 @@ from vap_core.simulation.suites import Suite, Task, suite
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Observation
 from vap_core.study.stats import rate
+from vap_core.study.table import printed
 from vap_core.study.trials import shipped
 from vap_core.study.workers import results
 from vap_make.films.captions import describe, distinguishes
@@ -209,7 +210,7 @@ def conclude(table: "pd.DataFrame") -> str:
             count = int(part[name].sum())
             line.append(str(rate(count, n)))
         lines.append(line)
-    return align(lines)
+    return printed(lines)
 
 
 def kept(path: Path) -> "pd.DataFrame | None":
