@@ -218,9 +218,12 @@ def curves(
     scale: float = 100.0,
     dashed: Sequence[str] = (),
     top: float | None = 103.0,
+    apart: str = "",
 ) -> "Figure":
     """A line per name in the column `series` along `x`, with its interval where there is one; the
     paper's values are dashed diamonds, and so are the lines of the series `dashed`.
+
+    The value at `apart` is no continuation of the others: no line leads to it.
     """
     figure, panels = _panels(table, panel, (3.2, 3.2), columns=4, sharey=True)
     colours = colours_of(names_in(table, series))
@@ -237,7 +240,11 @@ def curves(
             style = "--" if name in dashed else "-"
             few: dict[str, Any] = dict(marker=POLICY_MARKERS[i % len(POLICY_MARKERS)], markersize=4)
             look |= few if len(rows) <= 24 else {}
-            axes.plot(at, scale * rows["value"], style, label=name or None, **look)
+            values = scale * rows["value"].to_numpy(float)
+            last = (rows[x].astype(str) == apart).to_numpy()
+            axes.plot(at[~last], values[~last], style, label=name or None, **look)
+            if last.any():
+                axes.plot(at[last], values[last], **look | {"linestyle": "none"})
             if "low" in rows:
                 ends = scale * rows["low"], scale * rows["high"]
                 axes.fill_between(at, *ends, color=look["color"], alpha=0.15, linewidth=0)
@@ -349,7 +356,9 @@ def funnel(table: "pd.DataFrame") -> "Figure":
     if shown.groupby("suite")["n"].nunique().max() > 1:
         shown["panel"] = shown["suite"]
     label = "% of episodes left after the stage"
-    return curves(shown, "stage", panel="panel", series="method", label=label, dashed=bound)
+    return curves(
+        shown, "stage", panel="panel", series="method", label=label, dashed=bound, apart="SR"
+    )
 
 
 def _ends(rows: Sequence[Mapping[Any, Any]], scale: float = 100.0) -> np.ndarray:
