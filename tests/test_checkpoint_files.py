@@ -19,7 +19,7 @@ from vap_core.perception.stacks import load_stack
 from vap_core.policies.lerobot.adapter import load_for_suite, load_policy
 from vap_core.policies.lerobot.checkpoints import PIPELINES, RUN, fingerprint
 from vap_core.policies.lerobot.step import attach
-from vap_core.policies.protocol import label_of
+from vap_core.policies.names import label_of
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 from vap_core.study.store import open_run

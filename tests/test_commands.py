@@ -74,7 +74,7 @@ def test_an_unknown_name_shows_the_nearest_first() -> None:
     objects = [f"object-{i}" for i in range(140)]
     error = str(one_of("eval: object", "camra-personal", [*objects, "camera-personal"]))
     assert error.startswith("eval: object 'camra-personal' is unknown; known: camera-personal, ")
-    assert error.endswith(" and 117 more.")
+    assert all(name in error for name in objects)
     assert str(one_of("m:", "vpa", ["generic", "vap", "hard"])).endswith(
         "known: vap, generic, hard."
     )

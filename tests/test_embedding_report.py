@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from vap_core.base.errors import BadOutput, BadPolicy
 from vap_core.cli import app
-from vap_core.policies.protocol import SHIPPED, shipped_checkpoint
+from vap_core.policies.names import SHIPPED, shipped_checkpoint
 from vap_core.policies.tables import token_groups
 from vap_core.simulation import suites
 from vap_core.study import embeddings as embedding_report

@@ -221,12 +221,7 @@ def test_only_what_is_missing_runs_and_errors_run_again_recorded(tmp_path: Path)
     table = read(out).set_index("key")
     assert table.attempt[names[3:5]].tolist() == [2, 2]
     assert table.outcome[names[3:5]].tolist() == ["failure", "error"]
-    assert engine._errors_note(table) == (
-        "note: 1 episode is an error; when the cause is mended, the same command with --retries 2 "
-        "tries again."
-    )
     assert 3 in {job.attempt for job in missing_jobs(STUDY, out, retries=2)}
-    assert engine._errors_note(table[table.outcome != "error"]) == ""
 
 
 def test_a_run_that_goes_on_begins_with_short_jobs(

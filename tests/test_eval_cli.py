@@ -262,7 +262,11 @@ def test_a_run_of_errors_alone_is_no_success(tmp_path: Path) -> None:
     save_file(weights, policy / "model.safetensors")
     row = ("--suite", "simpler-bridge", "--task", "put-camera", "--episodes", "1")
     words = ("eval", *row, "--policy", policy, "--retries", "0", "--out", tmp_path / "run")
-    line = refused(*words)
+    done = vap(*words)
+    assert done.returncode == 2
+    *_, line = done.stderr.strip().splitlines()
+    assert "note: 2 episodes are errors; when the cause is mended, the same" in done.stderr
+    assert "--retries 1 tries again" in done.stderr
     assert "every one of the 2 episodes" in line
     assert "of 2 of them: " in line
     assert "finite" in line

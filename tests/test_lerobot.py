@@ -22,7 +22,8 @@ from vap_core.policies.lerobot.checkpoints import (
 )
 from vap_core.policies.lerobot.loading import compare
 from vap_core.policies.lerobot.toy_pi0 import toy_sizes
-from vap_core.policies.protocol import SHIPPED, TEXT, Policy, PolicyInput, checkpoint_of, label_of
+from vap_core.policies.names import SHIPPED, checkpoint_of, label_of
+from vap_core.policies.protocol import TEXT, Policy, PolicyInput
 from vap_core.rollout import calls
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import generic

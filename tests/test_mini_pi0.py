@@ -15,7 +15,8 @@ from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy, fused_attention
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
-from vap_core.policies.protocol import PolicyInput, checkpoint_of
+from vap_core.policies.names import checkpoint_of
+from vap_core.policies.protocol import PolicyInput
 from vap_make.words import vocabulary
 
 STATE, ACTION = 13, 7

@@ -14,7 +14,7 @@ from vap_core.base.types import Description
 from vap_core.instruction.rule import parse, rewrite
 from vap_core.perception.describe import COLOURS
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.protocol import SHIPPED
+from vap_core.policies.names import SHIPPED
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object

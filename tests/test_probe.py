@@ -10,7 +10,8 @@ import pytest
 from vap_core.base.errors import BadPolicy, BadStudy, UnknownName
 from vap_core.cli.measure import eval_policy
 from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.protocol import PolicyInput, label_of, shipped_checkpoint
+from vap_core.policies.names import label_of, shipped_checkpoint
+from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import PALETTE
 from vap_core.rollout.prompters import PromptContext, SceneTruth
 from vap_core.simulation import suites

@@ -7,7 +7,7 @@ import pytest
 
 from tests.pages import PAGES, PROSE, table
 from tests.published import RESULTS, episodes_of, in_percent, method_of, of_way, over_layouts
-from vap_core.policies.protocol import checkpoint_of
+from vap_core.policies.names import checkpoint_of
 from vap_core.study.failures import breakdown, list_failures
 from vap_core.study.results import load_runs, results
 from vap_core.study.stats import ALL_TASKS, Estimate

@@ -7,7 +7,7 @@ from vap_core import notebook
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import DATA, SHIPPED
 from vap_core.policies.lerobot.checkpoints import fingerprint
-from vap_core.policies.protocol import policy_label, shipped_checkpoint
+from vap_core.policies.names import policy_label, shipped_checkpoint
 from vap_core.prompt import PALETTE
 from vap_core.study import parsers
 from vap_core.study import shared as shared_scenes

@@ -11,7 +11,7 @@ from tests.command import vap
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.mini_pi0.learned_token import MODEL
 from vap_core.policies.mini_pi0.vlm import load_vlm
-from vap_core.policies.protocol import MINI, SHIPPED
+from vap_core.policies.names import MINI, SHIPPED
 from vap_core.simulation import suites
 from vap_core.study.store import read
 from vap_core.study.trials import default_policy, shipped

@@ -88,7 +88,7 @@ def test_masks_of_one_sample_a_pixel_are_those_of_several(scene, row):
     assert all((views[camera] == again[camera]).all() for camera in views)
     with SeveralSamples(scene.model, scene.renderer.objects, scene.renderer.shadows) as several:
         for camera, of_view in masks.items():
-            wanted = several.masks_and_hand(env._data, camera, env.image_hw, hidden=env._hidden())[
+            wanted = several.masks_and_hand(env._data, camera, env.image_hw, **env._shown(camera))[
                 0
             ]
             assert of_view.keys() == wanted.keys()

@@ -17,11 +17,11 @@ from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.learned_token import WORD, TokenTraining, photographs
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import MiniPI0Policy
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
-from vap_core.policies.protocol import SHIPPED
+from vap_core.policies.names import SHIPPED
 from vap_core.rollout.prompters import TextPrompter, soft_prompt
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import Suite
+from vap_core.simulation.suites import Suite, own
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.suites.suite import Task
 from vap_core.study import engine, trials
@@ -86,11 +86,11 @@ def test_my_cup_becomes_a_word() -> None:
 def test_the_words_beside_the_object_stay(category: str, instruction: str, read: str) -> None:
     """The methods of one table read the same command of an own suite."""
     task = Task(name="own", category=category, instruction=instruction, max_steps=9)
-    check_wording(task)
+    own.check_wording(task)
     (row,) = suites.rows("widowx-pick", "pick-straw-cup", 1)
-    own = replace(row, category=category, instruction=instruction)
+    mine = replace(row, category=category, instruction=instruction)
     scene = build_scene(row.suite, [place.model for place in row.placements])
-    prompter = make_prompter("soft", own, Path("nowhere"), scene, None)
+    prompter = make_prompter("soft", mine, Path("nowhere"), scene, None)
     scene.close()
     assert isinstance(prompter, TextPrompter)
     assert prompter.rewrite(instruction) == read

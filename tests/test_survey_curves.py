@@ -132,7 +132,7 @@ def test_the_report_tells_every_part() -> None:
     told = report(tables(), "toys")
     for part in (
         "stack toys",
-        "simpler-bridge 1 of 4, vlabench 2 of 8",
+        "vlabench 2 of 8, simpler-bridge 1 of 4",
         "K = 7, average",
         "vlabench side",
         "geometry",

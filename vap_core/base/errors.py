@@ -163,10 +163,6 @@ class WorkerDied(VapError):
     """A worker process that was killed; what it had not finished runs again."""
 
 
-SHOWN = 24
-"""Names that an error lists; of more, those nearest to what was written."""
-
-
 def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
     """The error for a name that a registry lacks, with the names that it holds, the nearest first.
 
@@ -175,9 +171,8 @@ def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
     names = sorted(set(map(str, known)))
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     near += [each for each in names if name and name in each and each not in near][:3]
-    ordered = [*near, *(each for each in names if each not in near)]
-    more = f" and {len(ordered) - SHOWN} more" if len(ordered) > SHOWN else ""
-    return UnknownName(f"{what} {name!r} is unknown; known: {', '.join(ordered[:SHOWN])}{more}.")
+    ordered = ", ".join([*near, *(each for each in names if each not in near)])
+    return UnknownName(f"{what} {name!r} is unknown; known: {ordered}.")
 
 
 EXTRAS = {

@@ -277,7 +277,7 @@ TASKS = {
 
 def profile(folder: Path, quick: bool) -> list[Arm]:
     """A control step of eval by part: every suite and two methods with the shipped policies."""
-    from vap_core.policies.protocol import MINI
+    from vap_core.policies.names import MINI
     from vap_core.study.engine import run_job, spread_evenly
     from vap_core.study.trials import Study, register_personal
 
@@ -348,7 +348,7 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
-    from vap_core.policies.protocol import MINI
+    from vap_core.policies.names import MINI
     from vap_core.rollout.loop import Trial, rollout
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites

@@ -324,7 +324,7 @@ def run_suites(asked: AskedOfAll) -> None:
     What can be checked before anything large is imported is checked first.
     """
     from vap_core.base.errors import BadSuite
-    from vap_core.policies.protocol import check_policy_name
+    from vap_core.policies.names import check_policy_name
 
     if asked.record is not None:
         record_of(asked.record)
@@ -357,7 +357,7 @@ def study_of(asked: AskedOfAll) -> "Study":
         BadSuite; else as `Study`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.policies.protocol import PRIVILEGED
+    from vap_core.policies.names import PRIVILEGED
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.suites import BENCHMARKS, open_file, tasks_of
     from vap_core.study.trials import Study, default_policy
@@ -419,7 +419,7 @@ def run_study(study: "Study", asked: AskedOfAll) -> None:
         BadCluster when there is none at the address; BadOutput, WorkerDied, as `engine.run`.
     """
     from vap_core.base.errors import BadStudy
-    from vap_core.policies.protocol import PRIVILEGED
+    from vap_core.policies.names import PRIVILEGED
     from vap_core.rollout.calls import named_queries
     from vap_core.study.engine import run
     from vap_core.study.report import conclude

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import signed, writing
 from vap_core.base.pictures import write_png
-from vap_core.policies.protocol import TEMPERATURE, checkpoint_of
+from vap_core.policies.names import TEMPERATURE, checkpoint_of
 from vap_core.study import charts, paper, store
 from vap_core.study.engine import Record, run
 from vap_core.study.logs import hiding_lines, switching_lines

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
 from vap_core.base.files import writing
 from vap_core.policies.lerobot.checkpoints import config_field, fingerprint, locate, stamp
-from vap_core.policies.protocol import MINI, POLICIES, shipped_checkpoint, unchanged_weights
+from vap_core.policies.names import MINI, POLICIES, shipped_checkpoint
+from vap_core.policies.protocol import unchanged_weights
 from vap_core.policies.tables import vocabulary_of, words_of
 from vap_core.rollout.types import Episode, EpisodeHeader
 from vap_core.simulation import suites

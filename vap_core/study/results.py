@@ -15,7 +15,7 @@ import numpy as np
 
 from vap_core.base.errors import LARGEST_SEED, BadOutput, VapError, command
 from vap_core.base.files import check_regular, parse_json, write_atomic
-from vap_core.policies.protocol import PRIVILEGED
+from vap_core.policies.names import PRIVILEGED
 from vap_core.simulation import suites
 from vap_core.study import paper
 from vap_core.study.stats import (

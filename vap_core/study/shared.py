@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vap_core.base.errors import BadOutput
-from vap_core.policies.protocol import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
+from vap_core.policies.names import MINI, TEMPERATURE, checkpoint_of, shipped_checkpoint
 from vap_core.simulation import suites
 from vap_core.simulation.suites import shared
 from vap_core.simulation.suites.benchmarks import FILMED_AREA

@@ -19,18 +19,12 @@ from vap_core.perception.stacks import check_stack, checksums, load_stack
 from vap_core.policies.lerobot import checkpoints
 from vap_core.policies.mini_pi0 import learned_token
 from vap_core.policies.mini_pi0.learned_token import WORD, file_suffix, model_of, teach, teach_own
-from vap_core.policies.protocol import MINI as MINI
-from vap_core.policies.protocol import POLICIES as POLICIES
-from vap_core.policies.protocol import PRIVILEGED as PRIVILEGED
-from vap_core.policies.protocol import SHIPPED as SHIPPED
-from vap_core.policies.protocol import (
-    Policy,
-    PrivilegedPolicy,
-    check_policy_name,
-    checkpoint_of,
-    label_of,
-    shipped_checkpoint,
-)
+from vap_core.policies.names import MINI as MINI
+from vap_core.policies.names import POLICIES as POLICIES
+from vap_core.policies.names import PRIVILEGED as PRIVILEGED
+from vap_core.policies.names import SHIPPED as SHIPPED
+from vap_core.policies.names import check_policy_name, checkpoint_of, label_of, shipped_checkpoint
+from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.scripted.scripted import Random, Scripted
 from vap_core.rollout.calls import check_policy

@@ -21,7 +21,7 @@ from vap_core.base.errors import BadOutput, BadStudy, one_of
 from vap_core.base.files import make_folder, read_parquet, write_atomic
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.policies.lerobot import adapter as lerobot
-from vap_core.policies.protocol import label_of
+from vap_core.policies.names import label_of
 from vap_core.prompt import ALPHA, PALETTE
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import PromptContext, unchanged

@@ -19,7 +19,7 @@ from vap_core.base.errors import BadPolicy, first_line
 from vap_core.policies.lerobot.checkpoints import refuse_code
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import MiniVlm
-from vap_core.policies.protocol import SHIPPED
+from vap_core.policies.names import SHIPPED
 from vap_make.policy.losses import Learner, embedding_cosine
 
 SCALES = "policy_preprocessor_step_4_normalizer_processor.safetensors"

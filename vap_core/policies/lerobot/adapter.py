@@ -32,13 +32,13 @@ from vap_core.policies.lerobot.hooks import (
 )
 from vap_core.policies.lerobot.loading import EMPTY, build
 from vap_core.policies.lerobot.traced import ChunkPredictor
+from vap_core.policies.names import label_of
 from vap_core.policies.protocol import (
     TEXT,
     Chunk,
     PolicyInput,
     attention_observed,
     inputs_observed,
-    label_of,
     phrases_of,
     report_input,
     state_sha256,
