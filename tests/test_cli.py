@@ -351,3 +351,12 @@ def test_what_cannot_be_shown_is_said_before_anything_is_run(
     monkeypatch.setattr("vap_core.recording.show.has_driver", lambda: False)
     line = refused(*words, "--png", tmp_path / "a.png")
     assert "apt-get install -y mesa-vulkan-drivers" in line
+
+
+def test_an_empty_memory_names_its_folder(
+    line: tuple[Path, tuple[str, ...]], tmp_path: Path
+) -> None:
+    """It said that "the memory holds nothing", and not which."""
+    empty = tmp_path / "nothing-here"
+    told = refused("ground", line[0], "bring my cup", "--memory", empty)
+    assert f"ground: {empty} holds no object; register one there, or name another folder" in told

@@ -320,12 +320,20 @@ def load(path: Path | str, encoder: str | None = None) -> PersonalObject:
         ) from error
 
 
-def load_bank(bank: Path | str, encoder: str | None = None) -> dict[str, PersonalObject]:
+def load_bank(
+    bank: Path | str, encoder: str | None = None, caller: str = ""
+) -> dict[str, PersonalObject]:
     """Every object of a bank by name; a bank that does not exist yet is empty.
 
-    Raises: BadMemory, as `load` and `object_files`.
+    Raises: BadMemory, as `load` and `object_files`; for an empty one where a `caller` needs some.
     """
-    return {obj.name: obj for obj in (load(path, encoder) for path in object_files(Path(bank)))}
+    found = {obj.name: obj for obj in (load(path, encoder) for path in object_files(Path(bank)))}
+    if caller and not found:
+        raise BadMemory(
+            f"{caller}: {bank} holds no object; register one there, or name another folder with "
+            "--memory."
+        )
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,7 +65,7 @@ def inspect_dataset(
     if copy is not None:
         _check_one_task(recorded, count)
     models = load_own(stack)
-    bank = load_bank(memory, models.encoder.name)
+    bank = load_bank(memory, models.encoder.name, "inspect-dataset")
     attender = Attender(models, bank, speaker=speaker)
     about = {
         "dataset": [str(path.resolve()), recorded.digest()],

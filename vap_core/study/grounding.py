@@ -132,7 +132,7 @@ def _attender(
     memory: Path, models: Stack, parsing: Parsing | None, always_tint: bool
 ) -> tuple[Attender, Mapping[str, PersonalObject]]:
     """The method with the remembered objects of a bank, and those."""
-    bank = load_bank(memory, models.encoder.name)
+    bank = load_bank(memory, models.encoder.name, "ground")
     parsing = parsing or Parsing()
     prompting = Prompting(always_tint=always_tint)
     parser = parsing.load(memory, bank)

@@ -277,12 +277,7 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     source = locate(checkpoint).resolve()
     memory = Path(memory).resolve()
     step = VapPrompt(str(memory), **options)
-    bank = load_bank(memory)
-    if not bank:
-        raise BadMemory(
-            f"attach: {memory} holds no object; register one there, or name another folder with "
-            "--memory."
-        )
+    bank = load_bank(memory, caller="attach")
     for name in step.objects or ():
         if name not in bank:
             raise one_of("attach: object", name, bank)
