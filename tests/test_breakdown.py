@@ -19,6 +19,7 @@ from vap_core.study.failures import (
     sub_cases_text,
 )
 from vap_core.study.report import report_page
+from vap_core.study.results import Runs
 from vap_core.study.table import printed
 
 STAGE_COLUMNS = [f"stage_{stage}" for stage in STAGES]
@@ -147,7 +148,9 @@ def test_a_method_that_reads_the_simulator_is_dashed() -> None:
 def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:
     of_generic = TABLE[TABLE.method == "generic"].dropna(axis="columns", how="all")
     table = of_generic.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
-    page = report_page(table, {}, pictures.empty_figure(1.0, 1.0), [], tmp_path)
+    page = report_page(
+        Runs(table, table[:0], {}, ()), {}, pictures.empty_figure(1.0, 1.0), [], tmp_path
+    )
     assert "Where episodes are lost" in page
     assert "Failures (2)" in page
 
@@ -167,7 +170,8 @@ def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
         name = recording_file_name("vlabench", "select-cup", each["episode"], 0, "generic")
         (tmp_path / "recordings" / name).write_bytes(b"")
     forest = pictures.empty_figure(1.0, 1.0)
-    page = report_page(pd.DataFrame(rows), {}, forest, [tmp_path], tmp_path)
+    table = pd.DataFrame(rows)
+    page = report_page(Runs(table, table[:0], {}, ()), {}, forest, [tmp_path], tmp_path)
     assert "Failures (1)" in page
     assert page.count("<article>") == 1
     assert "episode 0 · generic" in page
