@@ -40,7 +40,7 @@ def printed(table: "pd.DataFrame | Sequence[Sequence[str]]", style: Style = "tex
         return f"<div class='wide'><table>{lines}</table></div>"
     if style == "markdown":
         head, *body = [
-            [escape(cell, quote=False).replace("|", "\\|") for cell in row] for row in (head, *body)
+            [_no_html(cell).replace("|", "\\|") for cell in row] for row in (head, *body)
         ]
     form = {"text": "simple", "markdown": "github"}[style]
     text = tabulate(body, headers=head, tablefmt=form, disable_numparse=True)
@@ -53,6 +53,11 @@ def text_of(cell: Any) -> str:
         return "-"
     text = f"{cell:.6g}" if isinstance(cell, float) else str(cell)
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+
+
+def _no_html(cell: str) -> str:
+    """Text in which Markdown finds neither a tag nor an entity; "p < 0.001" is neither."""
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(r"&(?=#?\w+;)", "&amp;", cell))
 
 
 def _no_formula(cell: Any) -> Any:
