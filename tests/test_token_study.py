@@ -195,7 +195,7 @@ def test_the_usual_number_of_photos_comes_first_and_once_in_the_policy() -> None
     assert {job.where for job in Tokens((SUITE,), places=("vlm",)).jobs()} == {"vlm"}
     with pytest.raises(BadStudy, match="from 5 photos alone"):
         measure(Tokens((SUITE,), (3,), places=("policy",)), Path("none"), progress=False)
-    with pytest.raises(UnknownName, match="measure tokens: --learn-in"):
+    with pytest.raises(UnknownName, match="measure tokens: place"):
         Tokens((SUITE,), places=("here",))
     with pytest.raises(UnknownName, match="measure tokens: suite"):
         Tokens(("nowhere",))

@@ -39,7 +39,7 @@ _INSTALLED = _PACKAGE / "data"
 DATA = _INSTALLED if _INSTALLED.is_dir() else _PACKAGE.parent / "data"
 """Weights, policies and episode lists that ship: inside an installed package (setup.py copies them
 there), beside the package in a checkout."""
-WORKSPACE = Path.cwd() if DATA == _INSTALLED else DATA.parent
+WORKSPACE = Path() if DATA == _INSTALLED else DATA.parent
 """The folder of notebooks, figures and data: the checkout, wherever a notebook is run from."""
 SHIPPED = DATA / "policies"
 """The folder of the checkpoints that ship."""

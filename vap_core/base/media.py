@@ -103,8 +103,8 @@ def decode_picture(
 ) -> np.ndarray:
     """The pixels of a picture from outside, upright and in sRGB, h x w x 3 or 4, uint8.
 
-    Every picture that is decoded passes here: those of users, and those inside recordings and
-    meshes. `name` says in errors whose it is; `formats` are Pillow's names.
+    Users' pictures and those inside recordings pass here; what the readers of meshes open keeps to
+    the same limit and formats. `name` says in errors whose it is; `formats` are Pillow's names.
 
     Raises: BadPhoto: no picture of these formats, damaged, over MAX_PIXELS, or of more than 8 bits.
     """

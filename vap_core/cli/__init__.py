@@ -7,6 +7,7 @@ correct is one line, with status 2.
 import inspect
 import os
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
 import typer
@@ -72,7 +73,14 @@ class Terminal:
 def main() -> None:
     """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.stdout, sys.stderr = Terminal(sys.stdout), Terminal(sys.stderr, "\n\t\r")
+    out: Any = Terminal(sys.stdout)
+    errors: Any = Terminal(sys.stderr, "\n\t\r")
+    with redirect_stdout(out), redirect_stderr(errors):
+        _run()
+
+
+def _run() -> None:
+    """Run the command that the words name."""
     try:
         app()
     except VapError as error:

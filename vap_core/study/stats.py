@@ -125,8 +125,6 @@ def clustered_share(hits: Values, clusters: Iterable[object]) -> Estimate:
     variance over the variance that n independent cases would have. n / d is at least the number of
     clusters, which it also is where all hits are alike, and at most n.
     """
-    from statsmodels.stats.proportion import proportion_confint
-
     n = len(hits)
     if not n:
         return NONE
@@ -139,7 +137,7 @@ def clustered_share(hits: Values, clusters: Iterable[object]) -> Estimate:
         sums = np.bincount(number, hits - share)
         clustered = float((sums**2).sum()) / n**2 * count / (count - 1)
         worth = float(np.clip(n * independent / clustered, count, n)) if clustered > 0 else float(n)
-    low, high = proportion_confint(share * worth, worth, alpha=0.05, method="wilson")
+    (low,), (high,) = intervals(np.array([share * worth]), np.array([worth]))
     return Estimate(share, float(low), float(high), n)
 
 

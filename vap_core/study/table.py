@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
+from vap_core.base.errors import printable
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -52,7 +54,7 @@ def text_of(cell: Any) -> str:
     if cell is None or cell != cell:
         return "-"
     text = f"{cell:.6g}" if isinstance(cell, float) else str(cell)
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+    return printable(text, "")
 
 
 def _no_html(cell: str) -> str:

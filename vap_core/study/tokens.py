@@ -94,7 +94,7 @@ class Tokens(Measurement):
     def __post_init__(self) -> None:
         for place in self.places:
             if place not in PLACES:
-                raise one_of("measure tokens: --learn-in", place, PLACES)
+                raise one_of("measure tokens: place", place, PLACES)
         for name in self.suites:
             if name not in suites.BENCHMARKS:
                 raise one_of("measure tokens: suite", name, suites.BENCHMARKS)
