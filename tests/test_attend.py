@@ -23,7 +23,7 @@ from vap_core.prompt import PALETTE, Tint, tint
 from vap_core.study.forms import NumberedMarker
 from vap_core.vote import vote
 
-GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
+GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 140, 130)
 CUP, VASE = personal("mug", "cup", TEAL, TEAL, TEAL), personal("ming", "vase", SAND)
 MEMORY = {"mug": CUP, "ming": VASE}
 RED, BLUE = PALETTE[0], PALETTE[1]

@@ -1,13 +1,19 @@
 """The tint, pixel by pixel, and the choice of colours."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from matplotlib.colors import hsv_to_rgb, rgb_to_hsv
 
 from vap_core.base.errors import BadInstruction
 from vap_core.prompt import PALETTE, choose_colours, has_colour, tint
+from vap_core.simulation import suites
+from vap_core.simulation.assets.objects import get_object
+from vap_core.study.perception import opening_views
 
 RED = PALETTE[0]
 images = arrays(np.uint8, (7, 9, 3))
@@ -70,6 +76,60 @@ def test_a_colour_in_view_is_not_chosen() -> None:
     assert choose_colours(1, [(rgb, [~top])])[0].name == "blue"
     assert choose_colours(1, [(rgb * np.uint8(0), [top])])[0].name == "red"
     assert choose_colours(1, [])[0].name == "red"
+
+
+@given(st.integers(0, 359), st.integers(26, 100), st.integers(24, 100))
+def test_no_hue_is_without_a_name(hue: int, saturation: int, brightness: int) -> None:
+    """What an object of one hue is called, or may be called, is never chosen beside it."""
+    paint = hsv_to_rgb([hue / 360, saturation / 100, brightness / 100])
+    rgb = np.full((32, 32, 3), 128, np.uint8)
+    rgb[4:12, 4:12] = np.rint(255 * paint)
+    (chosen,) = choose_colours(1, [(rgb, [])])
+    assert away(hue, chosen.name) >= 75
+
+
+def test_an_object_between_two_names_has_both() -> None:
+    """A blue toy: a twelfth of it is called blue, a tenth cyan."""
+    rgb = np.full((200, 200, 3), 90, np.uint8)
+    toy = np.zeros((200, 200), bool)
+    toy[50:60, 50:60] = True
+    rgb[50:60, 50] = 40, 80, 200
+    rgb[50:59, 51] = 40, 170, 200
+    assert choose_colours(1, [(rgb, [toy])])[0].name in ("red", "yellow")
+
+
+def test_a_second_tint_is_no_neighbour_of_the_first() -> None:
+    first, second, third = choose_colours(3, [(np.full((8, 8, 3), 128, np.uint8), [])])
+    assert (first.name, second.name, third.name) == ("red", "blue", "green")
+
+
+ROWS = [
+    *(("simpler-fractal", "pick-pen-holder"), ("simpler-fractal", "move-bottle-near-coke-can")),
+    *(("simpler-bridge", "pick-shaver"), ("simpler-bridge", "put-camera")),
+    *(("vlabench", "select-cup"), ("tabletop", "select-vase")),
+]
+
+
+def test_a_name_in_a_scene_fits_nothing_else_there() -> None:
+    """Hue by matplotlib over the simulator's masks; the chooser has those of the category alone."""
+    for views in opening_views([suites.rows(*which, n=1)[0] for which in ROWS]):
+        row = views[0].row
+        scenes = [
+            (v.rgb, [m for n, m in v.visible().items() if get_object(n).category == row.category])
+            for v in views
+        ]
+        (chosen,) = choose_colours(1, scenes)
+        for view in views:
+            for name, mask in view.visible().items():
+                hue, saturation, brightness = rgb_to_hsv(view.rgb[mask] / 255).T
+                fits = (away(360 * hue, chosen.name) <= 40) & (saturation > 0.3)
+                assert name == row.target or (fits & (brightness > 0.25)).mean() < 0.12, name
+
+
+def away(hue_deg: Any, name: str) -> Any:
+    """Degrees to the hue of a name."""
+    named = ("red", "yellow", "green", "cyan", "blue", "magenta").index(name) * 60
+    return abs((hue_deg - named + 180) % 360 - 180)
 
 
 def test_several_targets_get_different_colours() -> None:

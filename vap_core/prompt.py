@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, Int16, UInt8
 
 from vap_core.base.errors import BadInstruction
 from vap_core.base.types import Colour, Mask, Rgb
@@ -28,15 +29,24 @@ PALETTE: tuple[Colour, ...] = (
 ALPHA = 0.5
 """Opacity of the tint (P appendix: the default of the opacity ablation)."""
 
+HUES = 12
+"""Hues that are told apart when a tint is chosen; a colour is as wide as three of them, so that
+what lies between two names counts for both."""
 OBJECT_SHARE = 0.12
-VIEW_SHARE = 0.01
-"""A tint is free while fewer than these shares of every candidate's, and of every view's, pixels
-have its colour."""
+VIEW_SHARE = 0.003
+"""A hue is had from these shares of a candidate's, and of a view's, pixels on."""
+PALEST, DARKEST = 64, 50
+"""Saturation and value (of 255) from which on a pixel has a hue."""
+ENOUGH = 75.0
+"""Distance (CIE 1976) from which on a tint contrasts with a scene."""
+SIDE = 224
+"""Pixels of a view's side that are looked at."""
 
-HUE_WIDTH_DEG = 25.0
-LEAST_SATURATION = 0.35
-LEAST_VALUE = 60.0
-"""A pixel has a tint's colour when its hue is that near, and it is saturated and bright enough."""
+HUE_WIDTH = 18
+LEAST_SATURATION = 89
+LEAST_VALUE = 60
+"""A pixel looks tinted when its hue (of 256) is that near, and it is saturated and bright enough
+(of 255)."""
 
 
 def tint(rgb: Rgb, mask: Mask, colour: Colour, alpha: float = ALPHA) -> Rgb:
@@ -80,32 +90,22 @@ class Tint:
 
 
 def has_colour(rgb: Pixels, colour: Colour) -> Bool[np.ndarray, "*n"]:
-    """Which pixels a person would call `colour`."""
-    return colour_maps(rgb, [colour])[0]
-
-
-def colour_maps(rgb: Pixels, colours: Sequence[Colour]) -> Bool[np.ndarray, "c *n"]:
-    """`has_colour` for several colours; the hue of every pixel is computed once."""
-    pixels = rgb.astype(np.float32)
-    top = pixels.max(axis=-1)
-    saturation = (top - pixels.min(axis=-1)) / np.maximum(top, 1.0)
-    vivid = (saturation >= LEAST_SATURATION) & (top >= LEAST_VALUE)
-    hue = _hue_deg(pixels[vivid])
-    found = np.zeros((len(colours), *vivid.shape), bool)
-    for has, colour in zip(found, colours, strict=True):
-        named = float(_hue_deg(np.asarray([colour.rgb], np.float32))[0])
-        has[vivid] = np.abs((hue - named + 180.0) % 360.0 - 180.0) <= HUE_WIDTH_DEG
-    return found
+    """Which pixels look as if they were tinted with `colour`."""
+    hue, saturation, value = np.moveaxis(_hsv(rgb), -1, 0)
+    away = (hue - _hsv(np.array(colour.rgb, np.uint8))[0] + 128) % 256 - 128
+    return (abs(away) <= HUE_WIDTH) & (saturation >= LEAST_SATURATION) & (value >= LEAST_VALUE)
 
 
 def choose_colours(
     count: int, scenes: Iterable[tuple[Rgb, Sequence[Mask]]], palette: Sequence[Colour] = PALETTE
 ) -> tuple[Colour, ...]:
-    """The first `count` tints that nothing in view already has (P 3.3: the tint must stand out).
+    """The tints that stand out most (P 3.3), the best first.
 
-    `scenes` pairs every view with the masks of the candidates in it. A tint is taken when its
-    colour covers more than `OBJECT_SHARE` of any candidate, or more than `VIEW_SHARE` of any view.
-    Free tints come first, in the palette's order; when too few are free, the least present follow.
+    `scenes` pairs every view with the masks of the candidates in it. A colour that no candidate and
+    no view has comes first: one of which no neighbour (60 degrees away) is had either, then any;
+    where none is left, the least present follows. What is chosen is had from then on. Among equals
+    the one that contrasts most with the views is taken, and the palette's first where they contrast
+    `ENOUGH`.
 
     Raises:
         BadInstruction: more targets than the palette has tints.
@@ -115,18 +115,44 @@ def choose_colours(
             f"choose_colours: {count} targets but {len(palette)} colours; name fewer objects at "
             "once."
         )
-    presence = np.zeros(len(palette))
+    paints = np.array([[colour.rgb for colour in palette]], np.uint8)
+    presence = np.zeros(HUES)
+    contrast = np.full(len(palette), ENOUGH)
     for rgb, masks in scenes:
-        found = colour_maps(rgb, palette)
-        presence = np.maximum(presence, found.mean(axis=(1, 2)) / VIEW_SHARE)
-        for mask in masks:
-            if mask.any():
-                presence = np.maximum(presence, found[:, mask].mean(axis=1) / OBJECT_SHARE)
-    order = np.argsort(np.maximum(presence, 1.0), kind="stable")
-    return tuple(palette[i] for i in order[:count])
+        step = -(-max(rgb.shape[:2]) // SIDE)
+        hues = _hues(rgb[::step, ::step])
+        parts = [(hues[mask[::step, ::step]], OBJECT_SHARE) for mask in masks]
+        for part, share in [(hues, VIEW_SHARE), *parts]:
+            counts = np.bincount(part.ravel(), minlength=HUES + 1)[:HUES]
+            wide = counts + np.roll(counts, 1) + np.roll(counts, -1)
+            presence = np.maximum(presence, wide / max(part.size, 1) / share)
+        scene = _lab(cv2.resize(rgb, (16, 16), interpolation=cv2.INTER_AREA))
+        away = np.linalg.norm(_lab(paints)[0] - scene.reshape(-1, 1, 3), axis=-1)
+        contrast = np.minimum(contrast, away.min(axis=0))
+    named = _hues(paints)[0]
+    chosen: list[Colour] = []
+    for _ in range(count):
+        own = np.maximum(presence, 1.0)
+        neighbours = np.maximum(np.roll(own, HUES // 6), np.roll(own, -HUES // 6)) > 1
+        order = np.lexsort((-contrast, neighbours[named], own[named]))
+        best = next(i for i in order if palette[i] not in chosen)
+        chosen.append(palette[best])
+        presence[named[best]] = np.inf
+    return tuple(chosen)
 
 
-def _hue_deg(pixels: np.ndarray) -> np.ndarray:
-    r, g, b = np.moveaxis(pixels, -1, 0)
-    angle = np.arctan2(np.sqrt(3.0) * (g - b), 2.0 * r - g - b)
-    return np.degrees(angle) % 360.0
+def _hsv(rgb: Pixels) -> Int16[np.ndarray, "*n 3"]:
+    """Hue (of 256), saturation and value (of 255)."""
+    hsv = cv2.cvtColor(rgb.reshape(1, -1, 3), cv2.COLOR_RGB2HSV_FULL)
+    return hsv.reshape(rgb.shape).astype(np.int16)
+
+
+def _hues(rgb: Rgb) -> Int16[np.ndarray, "h w"]:
+    """Which of `HUES` every pixel has; HUES where it has none."""
+    hue, saturation, value = np.moveaxis(_hsv(rgb), -1, 0)
+    nearest = ((hue * HUES + 128) // 256) % HUES
+    return np.where((saturation >= PALEST) & (value >= DARKEST), nearest, HUES)
+
+
+def _lab(rgb: Rgb) -> Float32[np.ndarray, "h w 3"]:
+    return cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
