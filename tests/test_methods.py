@@ -40,7 +40,7 @@ from vap_core.study.methods import METHODS
 from vap_core.study.store import open_run
 from vap_core.study.trials import Study, make_trial, register_personal
 
-GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 130, 90)
+GREY, TEAL, SAND = (90, 90, 90), (40, 120, 110), (150, 140, 130)
 RED = PALETTE[0]
 MUG = personal("mug", "cup", TEAL, TEAL)
 LINE = scene([(4, 20, GREY), (24, 20, TEAL), (44, 20, SAND)])

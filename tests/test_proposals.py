@@ -27,7 +27,7 @@ from vap_core.perception.embedded.proposer import (
 from vap_core.perception.protocols import Detector, Stack, Thresholds
 from vap_core.prompt import PALETTE, tint
 
-TEAL, SAND = (40, 120, 110), (150, 130, 90)
+TEAL, SAND = (40, 120, 110), (150, 140, 130)
 CUP_BOX, BOWL_BOX = (4, 20, 16, 32), (24, 20, 36, 32)
 DESK = scene([(4, 20, TEAL), (24, 20, TEAL), (44, 20, SAND)])
 MUG = personal("mug", "cup", TEAL, TEAL, TEAL)
