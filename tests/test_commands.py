@@ -1,16 +1,19 @@
 """The commands that are printed, to be run next: a shell reads back what was meant."""
 
+import ast
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import trimesh
 
 from tests.command import vap
 from tests.scanned import put
 from vap_core import cli
+from vap_core.__main__ import absent_packages
 from vap_core.base.errors import command, one_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,13 +63,33 @@ def test_no_command_is_printed_with_a_value_that_is_not_quoted() -> None:
         assert not found, path.name
 
 
-def test_another_python_is_told_the_set_up_in_one_line(tmp_path: Path) -> None:
-    """It was a traceback about lazy_loader."""
-    isolated = [sys.executable, "-S", "-m", "vap_core", "doctor"]
+@pytest.mark.parametrize("words", [("doctor",), ("eval", "--suite", "tabletop")])
+def test_another_python_is_told_the_set_up_in_one_line(words: tuple[str, ...]) -> None:
+    """It was a traceback about lazy_loader; `doctor` printed that line alone."""
+    isolated = [sys.executable, "-S", "-m", "vap_core", *words]
     done = subprocess.run(isolated, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     (line,) = done.stderr.strip().splitlines()
-    assert "run `make setup`, then .venv/bin/python -m vap_core" in line
+    assert line.startswith("error: vap_core's packages are not installed for ")
+    assert line.endswith("-m vap_core")
+    found = {row.split()[1]: row for row in done.stdout.splitlines()}
+    assert set(found) == (
+        {"python", "environment", "packages", "pictures", "display"}
+        if words == ("doctor",)
+        else set()
+    )
+    if found:
+        assert "absent: av, beartype, coacd" in found["packages"]
+        assert found["python"].startswith("ok ")
+
+
+def test_what_runs_without_the_environment_is_python_3_9(tmp_path: Path) -> None:
+    for name in ("__init__", "__main__"):
+        ast.parse((ROOT / "vap_core" / f"{name}.py").read_text(), feature_version=(3, 9))
+    (tmp_path / "pyproject.toml").write_text(
+        'dependencies = [\n    "pytest>=1",\n    "no-such>=2",\n]\n'
+    )
+    assert absent_packages(tmp_path / "pyproject.toml") == ["no-such"]
 
 
 def test_an_unknown_name_shows_the_nearest_first() -> None:

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING, Any
 try:
     import lazy_loader
 except ModuleNotFoundError as error:
-    _ABSENT = f"{error.name} is not installed for {sys.executable} (Python {sys.version.split()[0]}"
-    _ABSENT += "); run `make setup`, then .venv/bin/python -m vap_core"
     if sys.argv[:1] == ["-m"]:
-        sys.exit(f"error: {_ABSENT}")
-    raise ModuleNotFoundError(f"vap_core: {_ABSENT}", name=error.name) from error
+        from vap_core.__main__ import without_environment
+
+        sys.exit(without_environment())
+    raise ModuleNotFoundError(
+        f"vap_core: {error.name} is not installed for {sys.executable} (Python "
+        f"{sys.version.split()[0]}); run `make setup`, then .venv/bin/python",
+        name=error.name,
+    ) from error
 
 # Before any of them is imported, in this process and in those that it starts: nothing is sent out.
 for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):
