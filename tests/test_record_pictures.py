@@ -1,5 +1,8 @@
 """What a recording draws: labels of boxes, rims of masks, and the still picture of one."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -62,3 +65,26 @@ def test_screenshot_without_a_driver_names_the_package(
     with pytest.raises(MissingGL, match="apt-get install -y mesa-vulkan-drivers") as caught:
         screenshot(three[0], tmp_path / "one.png")
     assert "\n" not in str(caught.value)
+
+
+def test_screenshot_asks_for_a_driver_before_a_viewer_is_started(
+    tmp_path: Path, three: tuple[Path, EpisodeHeader, list[Frame]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It started one, and waited until that failed."""
+    monkeypatch.setattr("vap_core.recording.show.has_driver", lambda: False)
+    monkeypatch.setattr("vap_core.recording.show.subprocess", None)
+    with pytest.raises(MissingGL, match="apt-get install -y mesa-vulkan-drivers"):
+        screenshot(three[0], tmp_path / "one.png")
+
+
+def test_a_user_without_a_name_and_a_home_is_told_of_the_driver() -> None:
+    """`Path.home` raised."""
+    code = (
+        "import os, pwd; pwd.getpwuid = {}.__getitem__; import vap_core.recording.show as show; "
+        "os.environ.pop('VK_DRIVER_FILES', 0); show.has_driver(); print(os.environ['HOME'])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "HOME"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "/\n"), done.stderr

@@ -25,6 +25,8 @@ except ModuleNotFoundError as error:
 # Before any of them is imported, in this process and in those that it starts: nothing is sent out.
 for _switch in ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "DO_NOT_TRACK"):
     os.environ.setdefault(_switch, "1")
+if os.path.expanduser("~") == "~":  # a user without a name: libraries ask for a home, and raise
+    os.environ["HOME"] = "/"
 
 if TYPE_CHECKING:
     from vap_core.attend import Attender as Attender

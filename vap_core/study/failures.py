@@ -609,7 +609,9 @@ def save_screenshot(failures: Failures, number: int, png: Path, against: str | N
     Raises: as `side_by_side_recording`; MissingGL.
     """
     from vap_core.recording import screenshot
+    from vap_core.recording.show import check_viewer
 
+    check_viewer(window=False, picture=True)
     path, frame = recording_to_show(failures, number, against)
     screenshot(path, png, frame_index=frame, size=(1920, 1080))
     row = failure_row(failures, number)
