@@ -127,6 +127,9 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
     )
     told = run_as_told(command, tmp_path)
     assert told.returncode == 0, told.stderr
+    without = process("report", out, cwd=tmp_path)
+    assert without.returncode == 2
+    assert without.stderr.endswith(f"An own suite is found by its file: {command}\n")
     monkeypatch.setenv("VAP_SUITES", str(file))
     (line,) = provenance(load_runs([out])).command
     assert line.startswith(f"VAP_SUITES={shlex.quote(str(file))} python -m vap_core eval --suite ")

@@ -8,10 +8,12 @@ import inspect
 import os
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import typer
 
+from vap_core.base import errors
 from vap_core.base.errors import VapError, missing_part, printable
 from vap_core.cli import bench, look, machine, measure, own, run
 
@@ -79,12 +81,21 @@ def main() -> None:
         _run()
 
 
+def _own_suites() -> str:
+    """The command again, with the files of the own suites of the runs that it names."""
+    kept = [Path(word, ".suites") for word in sys.argv[1:]]
+    files = [file.read_text() for file in kept if file.is_file()] or ["FILE.py"]
+    line = errors.command(*sys.argv[1:], environment={"VAP_SUITES": ":".join(files)})
+    return f" An own suite is found by its file: {line}"
+
+
 def _run() -> None:
     """Run the command that the words name."""
     try:
         app()
     except VapError as error:
-        print(f"error: {printable(str(error), '')}", file=sys.stderr)
+        said = str(error) + (_own_suites() if "VAP_SUITES" in str(error) else "")
+        print(f"error: {printable(said, '')}", file=sys.stderr)
         sys.exit(2)
     except ModuleNotFoundError as error:
         part = missing_part(error)

@@ -16,7 +16,7 @@ from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
-from vap_core.base.files import writing
+from vap_core.base.files import write_atomic, writing
 from vap_core.policies.lerobot.checkpoints import config_field, fingerprint, locate, stamp
 from vap_core.policies.names import MINI, POLICIES, shipped_checkpoint
 from vap_core.policies.protocol import unchanged_weights
@@ -349,6 +349,9 @@ def run(
         return [replace(job, **how) for job in missing_jobs(study, folder, record, retries, short)]
 
     store.open_run(folder, study.configuration())
+    own_files = suites.own_files(suite for suite, _ in study.tasks)
+    if own_files:
+        write_atomic(folder / suites.own.FILES, ":".join(own_files).encode())
     for line in unknown_words_notes(study):
         print(line, file=sys.stderr)
     with store.locked(folder):

@@ -26,6 +26,8 @@ from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import AS_LISTED, EpisodeRow
 
 VARIABLE = "VAP_SUITES"
+FILES = ".suites"
+"""The file of a run's folder that names those of its own suites."""
 NAME = re.compile(r"[\w-]+")
 
 
