@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from PIL import Image
 
 from tests.command import Done, refused, vap
 from tests.toys import TOYS, MeanColour, scene
+from vap_core import get_object, reference_views
 from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Rgb
 from vap_core.memory import load, load_bank
@@ -189,3 +191,29 @@ def test_what_cannot_be_looked_at_is_one_line(
                 line = refused(*command)
                 assert f"cannot be read ({why}); " in line
                 assert "choose another folder with --memory" in line
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("becher", "the word 'becher': it proposes any object, .* is it English, spelt right"),
+        ("botle", "the word 'botle': .*; did you mean bottle"),
+        ("cup", ""),
+        ("espresso cup", ""),
+    ],
+)
+def test_a_word_that_the_detector_does_not_know_is_noted(
+    word: str, said: str, tmp_path: Path
+) -> None:
+    """It was remembered, and searched for, without a word; status 0 where nothing was found."""
+    photo, empty = tmp_path / "photo.png", tmp_path / "empty.png"
+    Image.fromarray(reference_views(get_object("cup-personal"), 1)[0]).save(photo)
+    Image.new("RGB", (224, 224), (120, 130, 140)).save(empty)
+    memory = ("--memory", tmp_path / "memory")
+    done = [vap("register", "mine", "--category", word, photo, "--whole", *memory)]
+    told = (f"bring my {word}", *memory, "--out", tmp_path / "out")
+    done += [vap("ground", picture, *told) for picture in (photo, empty)]
+    assert [each.returncode for each in done] == [0, 0, int(bool(said))]
+    for each in done:
+        assert ("does not know" in each.stderr) is bool(said)
+        assert re.search(said, each.stderr)

@@ -117,6 +117,7 @@ def register(
         paths += registering.film_photos(video, memory / f"{name}.frames", frames)
     given = registering.parse_given(box or [], mask or [], paths)
     models = load_stack(stack)
+    _print_unknown([category], stack)
     references = registering.choose(paths, category, models, given, whole=whole)
     doubtful = memory / f"{name}.doubtful.png"
     if not accept:
@@ -265,13 +266,16 @@ def ground(
     )
     note_uses(memory, found.used, speaker)
     _print_notes(stack, found.notes, always_tint)
+    is_unknown = _print_unknown([obj.category for obj in found.objects], stack)
     written = write_evidence(out, image.stem, found)
     if as_json:
         print(json.dumps(to_json(found)))
-        return
-    print(found)
-    paths = " and ".join(map(str, written))
-    print(f"wrote {paths}; look: {command('view', written[1])}")
+    else:
+        print(found)
+        paths = " and ".join(map(str, written))
+        print(f"wrote {paths}; look: {command('view', written[1])}")
+    if is_unknown and not found.used:
+        raise typer.Exit(1)
 
 
 def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
@@ -285,6 +289,17 @@ def note_uses(memory: Path, objects: Sequence[str], speaker: str) -> None:
         add_uses(memory, objects, speaker, datetime.now().astimezone())
     except BadOutput as error:
         print(f"note: {error}", file=sys.stderr)
+
+
+def _print_unknown(categories: Sequence[str], stack: str) -> bool:
+    """A note for every word that the detector does not know, and whether there is one."""
+    from vap_core.perception.stacks import load_stack
+    from vap_core.study.register import unknown_word
+
+    lines = [unknown_word(category, load_stack(stack)) for category in dict.fromkeys(categories)]
+    for line in filter(None, lines):
+        print(f"note: {line}", file=sys.stderr)
+    return any(lines)
 
 
 def _print_notes(stack: str, warnings: Sequence[str], always_tint: bool) -> None:

@@ -6,6 +6,7 @@ A box is chosen in every photo, all are shown on a contact sheet, and a doubtful
 import os.path
 import shlex
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -282,6 +283,25 @@ def load_others(memory: Path, name: str) -> tuple[dict[str, PersonalObject], tup
         else:
             known[obj.name] = obj
     return known, tuple(errors)
+
+
+def unknown_word(category: str, stack: Stack) -> str:
+    """A line where the stack's detector was not taught the word, "" where it was."""
+    from vap_core.perception.embedded.proposer import SNAP_COSINE, LiteDetector
+    from vap_core.perception.text_encoder import embed_text
+    from vap_core.simulation.assets.objects import CATEGORIES
+
+    detector = stack.by_category
+    if not isinstance(detector, LiteDetector):
+        return ""
+    if (detector.known @ embed_text([category])[0]).max() >= SNAP_COSINE:
+        return ""
+    near = get_close_matches(category, CATEGORIES, n=3, cutoff=0.75)
+    meant = f"; did you mean {' or '.join(near)}?" if near else "; is it English, spelt right?"
+    return (
+        f"the detector does not know the word {category!r}: it proposes any object, and the photos "
+        f"alone decide{meant}"
+    )
 
 
 def next_words(
