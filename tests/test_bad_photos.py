@@ -57,6 +57,14 @@ def test_a_photo_that_cannot_be_used_is_one_line(folder: Path, name: str, messag
     assert not (folder / "bank" / "new.object.safetensors").exists()
 
 
+@pytest.mark.parametrize(
+    "address", ["https://a.example/cup.jpg", "file:///cup.jpg", "s3://b/c.png"]
+)
+def test_an_address_is_no_photo(address: str, folder: Path) -> None:
+    line = refused("ground", address, "bring my cup", "--memory", folder / "bank")
+    assert "is an address, and nothing is fetched here; download it" in line
+
+
 def test_a_damaged_neighbour_is_named_before_anything_is_saved(
     folder: Path, tmp_path: Path
 ) -> None:

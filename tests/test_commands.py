@@ -101,4 +101,5 @@ def test_an_unknown_name_shows_the_nearest_first() -> None:
     assert str(one_of("m:", "vpa", ["generic", "vap", "hard"])).endswith(
         "known: vap, generic, hard."
     )
+    assert str(one_of("m:", "VPA", ["generic", "vap", "hard"])).endswith("vap, generic, hard.")
     assert str(one_of("m:", "cam", ["a-cam-b", "zzz"])).endswith("known: a-cam-b, zzz.")

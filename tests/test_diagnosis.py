@@ -393,7 +393,7 @@ def test_a_run_of_a_policy_that_has_moved_is_run_again_with_the_shipped_one() ->
         ({"suite": "vlabench"}, "no suite 'vlabench' here; there is widowx-pick"),
         ({"case": 2}, "no case 'case 2' here; there is unprompted"),
         ({"where": "margin <"}, "is none on this table"),
-        ({"where": "colour = 'red'"}, "its columns are"),
+        ({"where": "colour = 'red'"}, "columns: "),
         ({"where": "1 = 1; drop table episodes"}, "is none on this table"),
     ],
 )
@@ -410,6 +410,10 @@ def test_other_refusals(run: Path, tmp_path: Path) -> None:
         recording_of(list_failures(run), 3)
     with pytest.raises(BadOutput, match=r"run\.json is absent or damaged"):
         list_failures(tmp_path)
+    with pytest.raises(BadOutput, match=rf"holds no run; did you mean .*{run.name}"):
+        list_failures(run.with_name(f"{run.name}s"))
+    with pytest.raises(BadOutput, match="no table of finished runs .No such file or directory"):
+        list_failures(tmp_path / "none.parquet")
     with pytest.raises(BadOutput, match="is no table of finished runs"):
         list_failures(Path("data/results/perception_views.parquet"))
     with pytest.raises(BadOutput, match="before failures were diagnosed"):

@@ -1,5 +1,6 @@
 """Nothing that is started sends anything out: our commands, lerobot's, Rerun, Ray, JupyterLab."""
 
+import json
 import os
 import re
 import shlex
@@ -32,7 +33,11 @@ SOCKET = re.compile(r"sa_family=AF_INET6?, .*?(?:inet_addr\(|inet_pton\(AF_INET6
 def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
     tmp_path: Path,
 ) -> None:
-    """With an empty home, and no variable of ours or of a CI in the environment."""
+    """With an empty home, and no variable of ours or of a CI in the environment.
+
+    Of the tour Jupyter's kernel is reached on 127.0.0.1, and IPython makes its profile in the home,
+    as it does for every notebook.
+    """
     from PIL import Image
 
     home, bank = tmp_path / "home", tmp_path / "memory"
@@ -52,7 +57,13 @@ def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
         (sys.executable, lerobot, f"--policy.path={tmp_path / 'with-vap'}", "--env.type=vap",
          "--env.task=simpler-bridge/put-camera", "--env.max_steps=3", "--eval.n_episodes=1",
          "--eval.batch_size=1", f"--output_dir={tmp_path / 'lerobot'}"),
+        (sys.executable, "-m", "jupyter", "nbconvert", "--to", "notebook", "--execute",
+         tmp_path / "tour.ipynb", "--output", "out"),
     )  # fmt: skip
+    tour = json.loads((ROOT / "notebooks" / "00_tour.ipynb").read_text())
+    numbers = [i for i, cell in enumerate(tour["cells"]) if cell["cell_type"] == "code"]
+    tour["cells"] = tour["cells"][: numbers[8]]  # up to the vote, without the episodes
+    (tmp_path / "tour.ipynb").write_text(json.dumps(tour))
     kept = {k: v for k, v in os.environ.items() if k in ("PATH", "LD_LIBRARY_PATH", "TMPDIR")}
     environment = {**kept, "HOME": str(home), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     for number, command in enumerate(commands):
@@ -70,9 +81,9 @@ def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
         assert done.returncode == 0, (command, done.stderr[-2000:])
         reached = set(SOCKET.findall(log.read_text())) - {"127.0.0.1", "::1"}
         assert not reached, (command, reached)
-    # Matplotlib keeps its list of this machine's fonts there.
+    # Matplotlib keeps its list of this machine's fonts there, IPython an empty profile.
     written = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
-    assert written <= {(".cache", "matplotlib")}
+    assert written <= {(".cache", "matplotlib"), (".ipython", "profile_default")}
 
 
 @pytest.fixture

@@ -1,5 +1,8 @@
 """Text from files is escaped where it leaves: terminal, Markdown, CSV."""
 
+import shlex
+import subprocess
+import sys
 from io import StringIO
 from pathlib import Path
 
@@ -14,7 +17,8 @@ from vap_core.base.errors import printable
 from vap_core.cli import Terminal
 from vap_core.study.table import printed
 
-RESULTS = Path(__file__).resolve().parents[1] / "data" / "results"
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "data" / "results"
 ESCAPES = (
     "\x1b[2J",
     "\x1b]0;title\x07",
@@ -88,3 +92,21 @@ def test_commands_print_a_strangers_text_escaped(tmp_path: Path) -> None:
     assert "\\x1b[2J" in done.stdout + done.stderr
     line = refused("diagnose", tmp_path / "strange.parquet", "--method", "\x1b[2Jvap")
     assert "\x1b" not in line
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        ("ablate >&-", 0, ""),
+        ("ablate > /dev/full", 2, "cannot be printed (No space left on device)"),
+        ("ablate nothing 2>&-", 2, ""),
+        ("ablate nothing 2> /dev/full", 2, ""),
+        ("ablate >&- 2>&-", 0, ""),
+    ],
+)
+def test_where_nothing_can_be_printed_is_no_traceback(words: str, status: int, said: str) -> None:
+    line = f"{shlex.quote(sys.executable)} -m vap_core {words}"
+    done = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr

@@ -169,8 +169,10 @@ def one_of(what: str, name: str, known: Iterable[object]) -> UnknownName:
     `one_of("make_env: task", "x", TASKS)` reads "make_env: task 'x' is unknown; known: ...".
     """
     names = sorted(set(map(str, known)))
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
-    near += [each for each in names if name and name in each and each not in near][:3]
+    by_letters = {each.lower(): each for each in names}
+    asked = name.lower()
+    near = [by_letters[each] for each in get_close_matches(asked, by_letters, n=3, cutoff=0.5)]
+    near += [each for each in names if asked and asked in each.lower() and each not in near][:3]
     ordered = ", ".join([*near, *(each for each in names if each not in near)])
     return UnknownName(f"{what} {name!r} is unknown; known: {ordered}.")
 

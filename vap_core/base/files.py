@@ -18,6 +18,7 @@ import subprocess
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -211,7 +212,7 @@ def file_fault(path: Path) -> str:
     `Path.is_file` raises for a folder without rights, and for a name that is too long.
     """
     try:
-        if re.match(r"https?:/", str(path)):
+        if re.match(r"[a-z]\w+:/", str(path)):
             return "is an address, and nothing is fetched here; download it and name the file"
         if not path.is_file():
             return "is not a file"
@@ -391,14 +392,16 @@ def _asked(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "Iterator[SessionC
     try:
         yield context
     except Exception as error:  # datafusion raises bare exceptions
-        reason = " ".join(str(error).split())[:200]
-        columns = "; of ".join(
-            f"{name} its columns are {', '.join(str(c) for c in table.columns if c != LINE)}"
-            for name, table in tables.items()
-        )
-        raise BadStudy(
-            f"condition: {sql[:200]!r} is none on this table ({reason}); {columns}."
-        ) from error
+        reason = " ".join(str(error).split()).partition(" Valid fields are")[0][:200]
+        absent = re.search(r"No field named \"?(?:\w+\.)?(\w+)", reason)
+        columns = {str(c): 0 for table in tables.values() for c in table.columns if c != LINE}
+        near = get_close_matches(absent[1].lower(), columns) if absent else []
+        listed = f"columns: {', '.join(columns)}."
+        mend = f"did you mean {' or '.join(near)}?" if near else listed
+        shown = " ".join(sql.split())[:200]
+        fault = BadStudy(f"condition: {shown!r} is none on this table ({reason}); {mend}")
+        fault.is_whole = True
+        raise fault from error
 
 
 def _check_size(condition: str) -> None:

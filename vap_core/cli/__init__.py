@@ -7,14 +7,15 @@ correct is one line, with status 2.
 import inspect
 import os
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from vap_core.base import errors
-from vap_core.base.errors import VapError, missing_part, printable
+from vap_core.base.errors import BadOutput, VapError, missing_part, printable
 from vap_core.cli import bench, look, machine, measure, own, run
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
@@ -65,8 +66,27 @@ class Terminal:
 
     def write(self, text: str) -> int:
         """Write the text; the number of its characters."""
-        self._stream.write("\x1b[A".join(printable(p, self._kept) for p in text.split("\x1b[A")))
+        shown = "\x1b[A".join(printable(p, self._kept) for p in text.split("\x1b[A"))
+        with self._writing():
+            self._stream.write(shown)
         return len(text)
+
+    def flush(self) -> None:
+        with self._writing():
+            self._stream.flush()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Raises: BadOutput where nothing can be printed; notes and bars are left out then."""
+        try:
+            yield
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            if self._stream is not sys.__stderr__:
+                why = error.strerror or error
+                raise BadOutput(f"print: what was found cannot be printed ({why}).") from error
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -75,9 +95,10 @@ class Terminal:
 def main() -> None:
     """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    out: Any = Terminal(sys.stdout)
-    errors: Any = Terminal(sys.stderr, "\n\t\r")
-    with redirect_stdout(out), redirect_stderr(errors):
+    nowhere = open(os.devnull, "w")  # noqa: SIM115  for a stream that was closed
+    out: Any = Terminal(sys.stdout or nowhere)
+    errors: Any = Terminal(sys.stderr or nowhere, "\n\t\r")
+    with nowhere, redirect_stdout(out), redirect_stderr(errors):
         _run()
 
 
@@ -92,7 +113,10 @@ def _own_suites() -> str:
 def _run() -> None:
     """Run the command that the words name."""
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except VapError as error:
         said = str(error) + (_own_suites() if "VAP_SUITES" in str(error) else "")
         print(f"error: {printable(said, '')}", file=sys.stderr)

@@ -165,9 +165,9 @@ def read_published(path: Path) -> "list[Run]":
             runs.append((manifest, episodes.drop(columns="configuration")))
             check_run(path, *runs[-1])
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        fault = getattr(error, "strerror", None) or type(error).__name__
         raise BadOutput(
-            f"published: {path} is no table of finished runs ({type(error).__name__}); publish "
-            "writes one."
+            f"published: {path} is no table of finished runs ({fault}); publish writes one."
         ) from error
     return runs
 

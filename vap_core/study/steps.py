@@ -4,13 +4,14 @@
 each step and camera with the columns of its episode, `episodes` a row for each episode.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.base.errors import BadRecording, BadStudy
+from vap_core.base.errors import BadRecording, BadStudy, one_of
 from vap_core.base.files import read_parquet, select
 from vap_core.rollout.types import Episode, SubGoalSpan
 from vap_core.study import store
@@ -114,6 +115,8 @@ def query(run: Path, question: str) -> "pd.DataFrame":
     """
     steps, episodes = read(run)
     sql = question
+    if re.fullmatch(r"[\w-]+", question) and question not in {"true", "false", *QUESTIONS, *steps}:
+        raise one_of("query: question", question, QUESTIONS)
     if not question.lstrip().lower().startswith(("select", "with")):
         sql = MATCHES.format(QUESTIONS.get(question, question))
     return select({"steps": steps, "episodes": episodes}, sql)

@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 from uuid import uuid4
@@ -116,6 +117,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     damaged = f"run: {path} is absent or damaged; choose another folder, or run again with --out."
+    if not path.is_file():
+        beside = [each.parent.name for each in folder.parent.glob(f"*/{MANIFEST}")]
+        damaged = f"run: {path} is absent or damaged: {folder} holds no run"
+        near = get_close_matches(folder.name, beside, cutoff=0.4)
+        damaged += f"; did you mean {' or '.join(near)}?" if near else "; name the --out of one."
     try:
         manifest = parse_json(read_file(path))
     except (OSError, ValueError) as error:
