@@ -87,7 +87,10 @@ def test_a_correction_counts_in_a_query(run: Path) -> None:
     [
         ("margin <", "is none on this table"),
         ("nothing > 1", "No field named nothing"),
-        ("marjin > 1", "did you mean margin?"),
+        (
+            "marjin > 1",
+            "condition: 'marjin > 1' is none on this table (Schema error: No field named marjin.); did you mean margin or variant?",
+        ),
         ("near-mis", "query: question 'near-mis' is unknown; known: near-miss, "),
         ("select * from recordings", "is none on this table"),
         ("with a as (select 1) insert into steps select * from a", "is none on this table"),

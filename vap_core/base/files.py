@@ -361,24 +361,29 @@ def rows_matching(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
     Raises: BadStudy.
     """
     flat = table.reset_index(drop=True)
-    with _asked({"episodes": flat.assign(**{LINE: flat.index})}, condition) as context:
+    with _asked({"episodes": flat.assign(**{LINE: flat.index})}, condition, condition) as context:
         lines: list[int] = []
         for batch in context.table("episodes").filter(condition).select(LINE).collect():
             lines += batch[LINE].to_pylist()
     return flat.loc[sorted(lines)]
 
 
-def select(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "pd.DataFrame":
-    """What a SQL query over tables finds; it can change nothing. Raises: BadStudy."""
+def select(tables: "Mapping[str, pd.DataFrame]", sql: str, asked: str) -> "pd.DataFrame":
+    """What a SQL query over tables finds; it can change nothing. Errors show what was `asked`.
+
+    Raises: BadStudy.
+    """
     from datafusion import SQLOptions
 
     options = SQLOptions().with_allow_ddl(False).with_allow_dml(False).with_allow_statements(False)
-    with _asked(tables, sql) as context:
+    with _asked(tables, sql, asked) as context:
         return context.sql_with_options(sql, options).to_pandas()
 
 
 @contextmanager
-def _asked(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "Iterator[SessionContext]":
+def _asked(
+    tables: "Mapping[str, pd.DataFrame]", sql: str, asked: str
+) -> "Iterator[SessionContext]":
     """A session with some tables; what is wrong with a question to them is one line."""
     import pyarrow as pa
 
@@ -398,7 +403,7 @@ def _asked(tables: "Mapping[str, pd.DataFrame]", sql: str) -> "Iterator[SessionC
         near = get_close_matches(absent[1].lower(), columns) if absent else []
         listed = f"columns: {', '.join(columns)}."
         mend = f"did you mean {' or '.join(near)}?" if near else listed
-        shown = " ".join(sql.split())[:200]
+        shown = " ".join(asked.split())[:200]
         fault = BadStudy(f"condition: {shown!r} is none on this table ({reason}); {mend}")
         fault.is_whole = True
         raise fault from error

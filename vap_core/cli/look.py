@@ -82,7 +82,7 @@ def diagnose(
         --open 0
     Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method generic --open 0
         --against vap --png beside.png
-    Example: python -m vap_core diagnose data/runs/demo --where "margin < 0.3" --open 0
+    Example: python -m vap_core diagnose data/runs/demo --where "steps > 20" --open 0
         --png why.png
     Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip"
         --note "it held for a moment"

@@ -242,10 +242,10 @@ def evaluate(asked: AskedOfAll) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
     on. With --object, the tasks of its category.
 
-    Example: python -m vap_core eval --suite simpler-bridge --methods generic,vap --episodes 4
-        --out data/runs/bridge
+    Example: python -m vap_core eval --suite simpler-bridge --policy scripted
+        --methods generic,vap --episodes 4 --out data/runs/bridge
     Example: python -m vap_core eval --suite simpler-bridge --policy expert
-    Example: python -m vap_core eval --suite tabletop --object mug --out data/runs/mug
+    Example: python -m vap_core eval --suite tabletop --object mug --out data/runs/mug-all
     Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4
         --out data/runs/all
     Example: python -m vap_core eval --suite all --ray 10.0.0.5:6379

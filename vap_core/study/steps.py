@@ -119,7 +119,7 @@ def query(run: Path, question: str) -> "pd.DataFrame":
         raise one_of("query: question", question, QUESTIONS)
     if not question.lstrip().lower().startswith(("select", "with")):
         sql = MATCHES.format(QUESTIONS.get(question, question))
-    return select({"steps": steps, "episodes": episodes}, sql)
+    return select({"steps": steps, "episodes": episodes}, sql, question)
 
 
 def recording_at(run: Path, found: "pd.DataFrame", number: int) -> tuple[Path, int]:
