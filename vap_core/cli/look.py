@@ -229,6 +229,7 @@ def view(
         from vap_core.recording.show import attention_screenshot
 
         _check(recording)
+        _check_viewer(png)
         attention_screenshot(recording, png, frame_index=frame)
         print(f"wrote {png}")
     else:

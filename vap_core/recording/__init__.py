@@ -3,6 +3,9 @@
 Nothing outside this folder imports rerun; importing this folder does.
 """
 
+from pathlib import Path
+
+from vap_core.recording import show
 from vap_core.recording.clips import ClipRecorder as ClipRecorder
 from vap_core.recording.clips import ClipStep as ClipStep
 from vap_core.recording.clips import DatasetRecorder as DatasetRecorder
@@ -15,9 +18,19 @@ from vap_core.recording.recorder import is_failure_or_sampled as is_failure_or_s
 from vap_core.recording.show import combine_recordings as combine_recordings
 from vap_core.recording.show import open_viewer as open_viewer
 from vap_core.recording.show import rerun_version as rerun_version
-from vap_core.recording.show import screenshot as screenshot
 from vap_core.recording.show import view as view
 from vap_core.recording.show import write_film as write_film
 from vap_core.recording.stream import recording_file_name as recording_file_name
 from vap_core.recording.stream import recording_name as recording_name
 from vap_core.recording.stream import recover as recover
+
+
+def screenshot(
+    rrd: Path, png: Path, *, frame_index: int | None = None, size: tuple[int, int] = (1600, 1000)
+) -> None:
+    """`show.screenshot`, once a driver is there: a viewer would start, and fail later.
+
+    Raises: as it does.
+    """
+    show.check_viewer(window=False, picture=True)
+    show.screenshot(rrd, png, frame_index=frame_index, size=size)
