@@ -3,6 +3,7 @@
 import os
 import struct
 import time
+import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from PIL import Image
+from pillow_heif import from_pillow
 
 from tests.command import refused
 from vap_core.base.errors import BadPhoto, BadRecording
@@ -87,6 +89,193 @@ def test_the_profile_of_a_photo_is_applied(tmp_path: Path, space: str, mode: str
 def test_a_damaged_profile_says_nothing(tmp_path: Path) -> None:
     Image.new("RGB", (8, 8), (180, 120, 90)).save(tmp_path / "a.png", icc_profile=b"no profile")
     assert load_photo(tmp_path / "a.png")[4, 4].tolist() == [180, 120, 90]
+
+
+COLOUR = (180, 120, 90)
+P3_CHRM = struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
+
+
+def in_chunks(*chunks: tuple[bytes, bytes], colour: tuple[int, ...] = COLOUR) -> bytes:
+    """A PNG with some chunks behind its header."""
+    whole = BytesIO()
+    Image.new("RGB", (8, 8), colour).save(whole, "PNG")
+    added = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+    return whole.getvalue()[:33] + added + whole.getvalue()[33:]
+
+
+def profiled(mode: str, level: int, profile: bytes, suffix: str = "PNG") -> bytes:
+    whole = BytesIO()
+    Image.new("L", (8, 8), level).convert(mode).save(whole, suffix, icc_profile=profile)
+    return whole.getvalue()
+
+
+def avif(primaries: int, transfer: int) -> bytes:
+    whole = BytesIO()
+    Image.new("RGB", (64, 64), COLOUR).save(whole, "AVIF", quality=100, subsampling="4:4:4")
+    data = bytearray(whole.getvalue())
+    struct.pack_into(">HH", data, data.index(b"colrnclx") + 8, primaries, transfer)
+    return bytes(data)
+
+
+def heic(primaries: int) -> bytes:
+    whole = BytesIO()
+    from_pillow(Image.new("RGB", (64, 64), COLOUR)).save(
+        whole, quality=100, color_primaries=primaries, transfer_characteristics=13
+    )
+    return whole.getvalue()
+
+
+def of_camera() -> bytes:
+    """A JPEG whose EXIF says Adobe RGB by DCF's option, as cameras write it."""
+    whole, about = BytesIO(), Image.Exif()
+    about.get_ifd(0x8769)[0xA001] = 0xFFFF
+    about.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    Image.new("RGB", (8, 8), COLOUR).save(whole, "JPEG", quality=100, exif=about)
+    return whole.getvalue()
+
+
+def grey_icc() -> bytes:
+    """A profile of grey pictures in linear light."""
+    whole = icc(np.array(SPACES["Display P3"][0]), 1.0).replace(b"RGB XYZ ", b"GRAYXYZ ")
+    return whole.replace(b"rTRC", b"kTRC")
+
+
+P3_SRGB = (190, 117, 84)
+"""COLOUR of Display P3, by its definition."""
+DECLARED: dict[str, tuple[bytes, tuple[int, ...]]] = {
+    "grey profile, with alpha": (profiled("LA", 128, grey_icc()), (188,) * 3),
+    "grey profile, without": (profiled("L", 128, grey_icc(), "JPEG"), (188,) * 3),
+    "profile of colours on grey": (
+        profiled("L", 128, icc(np.array(SPACES["ProPhoto RGB"][0]), 1.8), "JPEG"), (146,) * 3
+    ),
+    "profile of other pictures": (profiled("CMYK", 255, icc(SRGB, 1.0), "JPEG"), (255,) * 3),
+    "gAMA": (in_chunks((b"gAMA", struct.pack(">I", 100_000)), colour=(55,) * 3), (128,) * 3),
+    "gAMA of sRGB": (in_chunks((b"gAMA", struct.pack(">I", 45455))), COLOUR),
+    "sRGB beside gAMA": (
+        in_chunks((b"sRGB", b"\0"), (b"gAMA", struct.pack(">I", 100_000))), COLOUR
+    ),
+    "cHRM": (in_chunks((b"gAMA", struct.pack(">I", 45455)), (b"cHRM", P3_CHRM)), (192, 117, 83)),
+    "cICP": (in_chunks((b"cICP", bytes([12, 13, 0, 1]))), P3_SRGB),
+    "cICP beside a profile": (
+        in_chunks(
+            (b"cICP", bytes([1, 13, 0, 1])), (b"iCCP", b"x\0\0" + zlib.compress(icc(SRGB, 1.0)))
+        ),
+        COLOUR,
+    ),
+    "HDR: white is 203 cd/m2": (
+        in_chunks((b"cICP", bytes([9, 16, 0, 1])), colour=(148,) * 3), (255,) * 3
+    ),
+    "AVIF": (avif(12, 13), P3_SRGB),
+    "HEIC": (heic(12), P3_SRGB),
+    "Adobe RGB of a camera": (of_camera(), (199, 120, 87)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DECLARED)
+def test_what_a_photo_declares_of_its_colours_is_applied(tmp_path: Path, kind: str) -> None:
+    data, expected = DECLARED[kind]
+    (tmp_path / "photo").write_bytes(data)
+    assert np.abs(load_photo(tmp_path / "photo")[4, 4].astype(int) - expected).max() <= 2
+
+
+def test_colours_that_are_not_read_are_refused_by_number(tmp_path: Path) -> None:
+    (tmp_path / "photo.png").write_bytes(in_chunks((b"cICP", bytes([22, 13, 0, 1]))))
+    with pytest.raises(BadPhoto, match=r"photo\.png declares colours 22/13 of ITU-T H\.273"):
+        load_photo(tmp_path / "photo.png")
+
+
+def test_a_damaged_photo_prints_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+) -> None:
+    whole = BytesIO()
+    Image.new("RGB", (8, 16), COLOUR).save(whole, "JPEG", quality=100)
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x05\x01"
+    part = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+    (tmp_path / "a.jpg").write_bytes(whole.getvalue()[:2] + part + whole.getvalue()[2:])
+    assert load_photo(tmp_path / "a.jpg").shape == (16, 8, 3)
+    assert capfd.readouterr() == ("", "")
+    assert not recwarn
+
+
+CORNER = np.zeros((32, 64, 3), np.uint8)
+CORNER[:8, :8, 1] = 255
+
+
+def coded(
+    path: Path, rgb: np.ndarray, matrix: int = 2, wide: int = 0, codes: tuple[int, int] = (2, 2)
+) -> Path:
+    """A video of one picture by a matrix and a range (2 is full), as it says, and says of colours."""
+    red, blue = {2: (0.299, 0.114), 6: (0.299, 0.114), 1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}[
+        matrix
+    ]
+    r, g, b = np.moveaxis(rgb / 255, 2, 0)
+    luma = red * r + (1 - red - blue) * g + blue * b
+    chroma = (b - luma) / (2 - 2 * blue), (r - luma) / (2 - 2 * red)
+    levels = [255 * luma, *(128 + 255 * part for part in chroma)]
+    if wide != 2:
+        levels = [16 + 219 * luma, *(128 + 224 * part for part in chroma)]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"qp": "0"})
+        stream.height, stream.width, stream.pix_fmt = *rgb.shape[:2], "yuv444p"
+        codec = stream.codec_context
+        codec.colorspace, codec.color_range = matrix, wide
+        codec.color_primaries, codec.color_trc = codes
+        frame = av.VideoFrame(*rgb.shape[1::-1], "yuv444p")
+        frame.colorspace, frame.color_range = matrix, wide
+        for plane, level in zip(frame.planes, levels, strict=True):
+            plane.update(np.round(level).clip(0, 255).astype(np.uint8).tobytes())
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("given", "matrix", "wide", "codes", "expected"),
+    [
+        ((180, 60, 40), 1, 1, (1, 1), (180, 60, 40)),  # it was 170, 48, 41
+        ((180, 60, 40), 1, 2, (1, 1), (180, 60, 40)),
+        ((180, 60, 40), 6, 1, (1, 1), (180, 60, 40)),
+        ((180, 60, 40), 6, 2, (1, 1), (180, 60, 40)),
+        ((180, 60, 40), 9, 1, (1, 1), (180, 60, 40)),
+        (COLOUR, 1, 1, (12, 13), P3_SRGB),
+        ((191, 191, 191), 9, 1, (9, 18), (255, 255, 255)),  # HLG, white
+        ((148, 148, 148), 9, 1, (9, 16), (255, 255, 255)),  # PQ, white
+    ],
+)
+def test_the_colours_of_a_video_are_as_it_says(
+    tmp_path: Path, given: tuple[int, ...], matrix: int, wide: int, codes, expected
+) -> None:
+    path = coded(tmp_path / "a.mp4", np.full((32, 64, 3), given, np.uint8), matrix, wide, codes)
+    (rgb,) = frames(path)
+    assert np.abs(rgb[9, 9].astype(int) - expected).max() <= 3
+
+
+ONE = 65536
+TURNS = {
+    "0": ((ONE, 0, 0, ONE), lambda rgb: rgb),
+    "90": ((0, ONE, -ONE, 0), lambda rgb: np.rot90(rgb, -1)),
+    "180": ((-ONE, 0, 0, -ONE), lambda rgb: np.rot90(rgb, 2)),
+    "270": ((0, -ONE, ONE, 0), lambda rgb: np.rot90(rgb)),
+    "mirrored": ((-ONE, 0, 0, ONE), np.fliplr),
+    "upside down": ((ONE, 0, 0, -ONE), np.flipud),
+    "transposed": ((0, ONE, ONE, 0), lambda rgb: rgb.transpose(1, 0, 2)),
+    "zero": ((0, 0, 0, 0), lambda rgb: rgb),
+}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_video_is_turned_and_mirrored_as_it_says(tmp_path: Path, turn: str) -> None:
+    (a, b, c, d), turned = TURNS[turn]
+    data = bytearray(coded(tmp_path / "a.mp4", CORNER).read_bytes())
+    struct.pack_into(">9i", data, data.index(b"tkhd") + 44, a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    (tmp_path / "a.mp4").write_bytes(data)
+    (rgb,) = frames(tmp_path / "a.mp4")
+    expected = turned(CORNER)
+    assert rgb.shape == expected.shape
+    assert ((rgb[..., 1] > 127) == (expected[..., 1] > 127)).all()
 
 
 def claims(side: int) -> bytes:
@@ -165,6 +354,9 @@ LISTS: dict[str, Callable[[str], str]] = {
     "mpd": lambda name: (
         f'<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011">{name}</MPD>'
     ),
+    "xspf": lambda name: f"<playlist><trackList><location>{name}</location></trackList></playlist>",
+    "asx": lambda name: f"<asx><entry><ref href='{name}'/></entry></asx>",
+    "pls": lambda name: f"[playlist]\nFile1={name}\nNumberOfEntries=1\n",
     "sdp": lambda name: "v=0\nc=IN IP4 127.0.0.1\nm=video 5000 RTP/AVP 96\n",
 }
 

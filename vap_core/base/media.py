@@ -1,8 +1,10 @@
 """Photos and videos from outside, decoded within one limit of pixels."""
 
+import re
+import struct
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from io import BufferedReader, BytesIO
 from itertools import pairwise
@@ -10,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from vap_core.base.errors import BadOutput, BadPhoto
 from vap_core.base.files import file_fault, replacing
@@ -100,11 +102,16 @@ def decode_picture(
     name: str,
     mode: str = "RGB",
     formats: tuple[str, ...] = PICTURE_FORMATS,
+    *,
+    upright: bool = True,
+    convert: bool = True,
 ) -> np.ndarray:
     """The pixels of a picture from outside, upright and in sRGB, h x w x 3 or 4, uint8.
 
-    Users' pictures and those inside recordings pass here; what the readers of meshes open keeps to
-    the same limit and formats. `name` says in errors whose it is; `formats` are Pillow's names.
+    Users' pictures, those inside recordings and the textures of meshes pass here. Texture
+    coordinates are of the picture as it is stored (not `upright`), and glTF's textures are in sRGB
+    whatever they declare (not `convert`). `name` says in errors whose it is; `formats` are Pillow's
+    names.
 
     Raises: BadPhoto: no picture of these formats, damaged, over MAX_PIXELS, or of more than 8 bits.
     """
@@ -112,8 +119,9 @@ def decode_picture(
 
     over = f"pixels, over {MAX_PIXELS / 1e6:.0f} million; scale it down."
     try:
+        head = source.read(HEAD_BYTES)
         with (
-            warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning),
+            warnings.catch_warnings(action="ignore"),  # of Pillow, at what is damaged or large
             Image.open(source, formats=formats) as image,
         ):
             if image.width * image.height > MAX_PIXELS:
@@ -123,12 +131,14 @@ def decode_picture(
                     f"{name} has {image.mode} pixels, more than 8 bits each; save it as an 8-bit "
                     "JPEG or PNG."
                 )
-            upright = _in_srgb(ImageOps.exif_transpose(image))
-            if mode == "RGB" and upright.has_transparency_data:
+            space = _declared_space(image, head, name) if convert else None
+            found = ImageOps.exif_transpose(image) if upright else image
+            found = _in_srgb(found, space) if convert else found
+            if mode == "RGB" and found.has_transparency_data:
                 # What is hidden in the file is no part of the picture.
-                grey = Image.new("RGBA", upright.size, (BEHIND, BEHIND, BEHIND, 255))
-                upright = Image.alpha_composite(grey, upright.convert("RGBA"))
-            return np.array(upright.convert(mode), dtype=np.uint8)
+                grey = Image.new("RGBA", found.size, (BEHIND, BEHIND, BEHIND, 255))
+                found = Image.alpha_composite(grey, found.convert("RGBA"))
+            return np.array(found.convert(mode), dtype=np.uint8)
     except BadPhoto:
         raise
     except UnidentifiedImageError as error:
@@ -144,27 +154,164 @@ def decode_picture(
         ) from error
 
 
-def _in_srgb(image: "Image.Image") -> "Image.Image":
-    """The picture with its colours as sRGB says them, by the ICC profile in its file.
+Channels = Float[np.ndarray, "*shape"]
 
-    A profile that cannot be read says nothing.
+
+def to_srgb(linear: Channels) -> Channels:
+    """Light from 0 to 1 as sRGB encodes it, 0 to 1."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def to_linear(srgb: Channels) -> Channels:
+    """The light that sRGB encodes, both from 0 to 1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _power(exponent: float) -> Callable[[Channels], Channels]:
+    return lambda level: level**exponent
+
+
+def _pq(level: Channels) -> Channels:
+    """SMPTE ST 2084; white is 203 cd/m2 (ITU-R BT.2408)."""
+    root = level ** (1 / 78.84375)
+    return (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
+        1 / 0.1593017578125
+    ) * (10_000 / 203)
+
+
+def _hlg(level: Channels) -> Channels:
+    """ARIB STD-B67 on a display of 1000 cd/m2, channel by channel; white is 203 cd/m2."""
+    scene = np.where(
+        level <= 0.5, level**2 / 3, (np.exp((level - 0.55991073) / 0.17883277) + 0.28466892) / 12
+    )
+    return scene**1.2 * (1000 / 203)
+
+
+D65, D65_RED = (0.3127, 0.3290), (0.64, 0.33)
+PRIMARIES = {
+    1: (*D65, *D65_RED, 0.30, 0.60, 0.15, 0.06),
+    5: (*D65, *D65_RED, 0.29, 0.60, 0.15, 0.06),
+    6: (*D65, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07),
+    7: (*D65, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07),
+    9: (*D65, 0.708, 0.292, 0.170, 0.797, 0.131, 0.046),
+    11: (0.314, 0.351, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06),
+    12: (*D65, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06),
+}
+"""x and y of white, red, green and blue, by the number that ITU-T H.273 gives them; 1 is sRGB's."""
+TRANSFERS = {code: to_linear for code in (1, 6, 13, 14, 15)} | {
+    4: _power(2.2), 5: _power(2.8), 8: _power(1.0), 16: _pq, 18: _hlg,
+}  # fmt: skip
+"""The light of a level, both from 0 to 1, by H.273's number. Films of 1, 6, 14 and 15 are shown as
+sRGB."""
+UNSAID = (0, 2, 3)
+ADOBE_RGB = (*D65, *D65_RED, 0.21, 0.71, 0.15, 0.06)
+HEAD_BYTES = 65536
+"""Of a picture's file, in which the codes of its colours stand."""
+Space = tuple[tuple[float, ...], Callable[[Channels], Channels]]
+"""Primaries as above, and the light of a level."""
+
+
+def _space_of(primaries: int, transfer: int, name: str) -> Space | None:
+    """The colours of two codes of H.273; None for sRGB. Raises: BadPhoto for those not read."""
+    primaries, transfer = (1 if code in UNSAID else code for code in (primaries, transfer))
+    if primaries not in PRIMARIES or transfer not in TRANSFERS:
+        raise BadPhoto(
+            f"{name} declares colours {primaries}/{transfer} of ITU-T H.273, which are not read "
+            "here; export it in sRGB."
+        )
+    space = PRIMARIES[primaries], TRANSFERS[transfer]
+    return None if space == (PRIMARIES[1], to_linear) else space
+
+
+def _declared_space(image: "Image.Image", head: bytes, name: str) -> Space | None:
+    """The colours that a picture's file declares beside an ICC profile; None where they are sRGB.
+
+    PNG's cICP comes before a profile, all others behind it. Raises: BadPhoto.
+    """
+    info = image.info
+    if image.format == "PNG":
+        codes = re.search(rb"cICP(.)(.)", head.partition(b"IDAT")[0], re.DOTALL)
+        if codes:
+            info.pop("icc_profile", None)
+            return _space_of(codes[1][0], codes[2][0], name)
+    if info.get("icc_profile"):
+        return None
+    if "srgb" not in info and ("gamma" in info or "chromaticity" in info):
+        gamma = info.get("gamma", 0.45455)
+        usual = abs(gamma - 0.45455) < 1e-3 and "chromaticity" not in info
+        light = to_linear if usual else _power(1 / max(gamma, 1e-3))
+        return tuple(info.get("chromaticity", PRIMARIES[1])), light
+    if image.format == "AVIF" and (codes := re.search(rb"colrnclx.(.).(.)", head, re.DOTALL)):
+        return _space_of(codes[1][0], codes[2][0], name)
+    if nclx := info.get("nclx_profile"):
+        return _space_of(nclx["color_primaries"], nclx["transfer_characteristics"], name)
+    with suppress(Exception):  # a damaged EXIF says nothing
+        if str(image.getexif().get_ifd(0xA005).get(1, "")).startswith("R03"):  # DCF's option
+            return ADOBE_RGB, _power(563 / 256)
+    return None
+
+
+def _xyz(primaries: Sequence[float]) -> np.ndarray:
+    """The matrix from a space's linear RGB to CIE XYZ, adapted to sRGB's white (Bradford)."""
+    x, y = np.reshape(primaries, (4, 2)).T
+    white, *_ = points = np.stack([x / y, np.ones(4), (1 - x - y) / y], axis=1)
+    columns = points[1:].T
+    matrix = columns * np.linalg.solve(columns, white)
+    cones = np.array(
+        [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+    )
+    target = np.array([D65[0] / D65[1], 1, (1 - sum(D65)) / D65[1]])
+    return np.linalg.solve(cones, (cones @ target / (cones @ white))[:, None] * (cones @ matrix))
+
+
+def _space_to_srgb(rgb: Rgb, space: Space) -> Rgb:
+    """The picture of a space in sRGB; what sRGB cannot show is clipped."""
+    primaries, light = space
+    matrix = np.linalg.solve(_xyz(PRIMARIES[1]), _xyz(primaries)).T.astype(np.float32)
+    table = light(np.arange(256) / 255).astype(np.float32)
+    found = np.empty_like(rgb)
+    for rows, into in zip(
+        *(np.array_split(array, -(-rgb.size // 3_000_000)) for array in (rgb, found)), strict=True
+    ):
+        into[:] = np.round(255 * to_srgb(table[rows] @ matrix))
+    return found
+
+
+MODES = {"GRAY": "L", "RGB ": "RGB", "CMYK": "CMYK", "Lab ": "LAB"}
+"""The mode of the pictures that a profile is for, by the profile's own word."""
+
+
+def _in_srgb(image: "Image.Image", space: Space | None) -> "Image.Image":
+    """The picture with its colours as sRGB says them, by its `space` or the ICC profile in its
+    file.
+
+    A profile that cannot be read, or is for other pictures, says nothing.
     """
     from PIL import Image, ImageCms
 
     profile = image.info.get("icc_profile")
-    if not profile:
+    if space is None and not profile:
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
-    if image.mode not in ("L", "CMYK", "LAB"):
-        image = image.convert("RGB")
-    try:
-        given = ImageCms.ImageCmsProfile(BytesIO(profile))
-        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        srgb = ImageCms.createProfile("sRGB")
-        found = ImageCms.profileToProfile(image, given, srgb, intent, outputMode="RGB")
-    except (ImageCms.PyCMSError, OSError, ValueError):
-        found = image
-    assert isinstance(found, Image.Image)
+    if space is not None:
+        found = Image.fromarray(_space_to_srgb(np.array(image.convert("RGB")), space))
+    else:
+        own = {"1": "L", "LA": "L"}.get(image.mode, image.mode)
+        own = own if own in ("L", "CMYK", "LAB") else "RGB"
+        try:
+            given = ImageCms.ImageCmsProfile(BytesIO(profile))
+            mode = MODES.get(given.profile.xcolor_space, "")
+            mode = mode if mode == own or (mode, own) == ("RGB", "L") else own
+            intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+            srgb = ImageCms.createProfile("sRGB")
+            converted = ImageCms.profileToProfile(
+                image.convert(mode), given, srgb, intent, outputMode="RGB"
+            )
+            assert converted is not None
+            found = converted
+        except (ImageCms.PyCMSError, OSError, ValueError):
+            found = image
     if alpha is not None:
         found = found.convert("RGB")
         found.putalpha(alpha)
@@ -219,10 +366,13 @@ def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
         that can be decoded.
     """
     with _opened(path) as container:
+        codec = container.streams.video[0].codec_context
+        space = _space_of(codec.color_primaries, codec.color_trc, f"video: {path}")
         for number, frame in enumerate(container.decode(video=0)):
             if number >= MAX_FRAMES:
                 return
-            yield _picture(frame, long_side)
+            rgb = _picture(frame, long_side)
+            yield rgb if space is None else _space_to_srgb(rgb, space)
 
 
 @contextmanager
@@ -373,14 +523,29 @@ def frame_rate(path: Path) -> float:
 
 
 def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:
-    """One decoded frame upright, as RGB."""
+    """One decoded frame upright, as RGB by its own matrix and range."""
+    from av.video.reformatter import ColorRange, Colorspace
+
     width, height = frame.width, frame.height
     if long_side is not None and max(width, height) > long_side:
         scale = long_side / max(width, height)
         width, height = round(width * scale), round(height * scale)
-    rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
-    turns = round(frame.rotation / 90) % 4
-    return np.ascontiguousarray(np.rot90(rgb, turns))
+    # PyAV converts by the matrix and the range of a frame only where the result's are others.
+    other = Colorspace.ITU601 if frame.colorspace != Colorspace.ITU601 else Colorspace.ITU709
+    rgb = frame.to_ndarray(
+        format="rgb24",
+        width=width,
+        height=height,
+        src_colorspace=frame.colorspace,
+        dst_colorspace=other,
+        src_color_range=frame.color_range,
+        dst_color_range=ColorRange.JPEG,
+    )
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    a, b, _, c, d = np.frombuffer(matrix or struct.pack("=5i", 1, 0, 0, 0, 1), np.int32, 5).tolist()
+    if abs(b) > abs(a):  # columns become rows
+        rgb, a, d = rgb.transpose(1, 0, 2), c, b
+    return np.ascontiguousarray(rgb[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def _sharpness(rgb: Rgb) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vap_core.base.errors import BadObject
 from vap_core.base.files import parse_json
+from vap_core.base.media import to_linear, to_srgb
 
 TRANSFORM = "KHR_texture_transform"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
@@ -22,17 +23,6 @@ HARMLESS = re.compile(r"KHR_(materials_\w+|lights_\w+|xmp\w*|animation_pointer|n
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 UBYTE, FLOAT = 5121, 5126
-
-
-def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Light from 0 to 1 as sRGB encodes it, 0 to 1."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """The light that sRGB encodes, both from 0 to 1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def multiply(one: np.ndarray, other: np.ndarray) -> np.ndarray:
