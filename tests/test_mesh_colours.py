@@ -1,8 +1,10 @@
 """The colours of 3-D files: every source that a format has, as the format says it."""
 
+import base64
 import json
 import struct
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from tests.command import refused
+from tests.test_media import SPACES, icc
 from vap_core.base.errors import BadObject
 from vap_core.simulation.assets.scans.mesh_file import read_mesh_file
 
@@ -152,12 +155,103 @@ def rotated(scene: Scene) -> None:
     surface(scene)["baseColorTexture"]["extensions"] = turn
 
 
+def undeclared(where: str, name: str) -> Callable[[Scene], object]:
+    return lambda scene: scene[where][-1].update(extensions={name: {}})
+
+
+def posed(**more: object) -> Callable[[Scene], object]:
+    return lambda scene: [node.update(more) for node in scene["nodes"] if "mesh" in node]
+
+
+def wrapped(mode: int) -> Callable[[Scene], object]:
+    """A picture that is not repeated, moved by its whole width."""
+
+    def change(scene: Scene) -> None:
+        scene["samplers"] = [{"wrapS": mode}]
+        scene["textures"][0]["sampler"] = 0
+        where = {"KHR_texture_transform": {"offset": [1, 0]}}
+        surface(scene)["baseColorTexture"]["extensions"] = where
+
+    return change
+
+
+def whole_png(kind: type = np.uint8) -> bytes:
+    whole = BytesIO()
+    Image.fromarray(np.full((8, 8), 90, kind)).save(whole, "PNG")
+    return whole.getvalue()
+
+
+def stored(data: bytes) -> Callable[[Scene], object]:
+    """The texture as a picture inside the file's own text."""
+    uri = "data:image/png;base64," + base64.b64encode(data).decode()
+    return lambda scene: scene.update(images=[{"uri": uri}])
+
+
+def glowing(scene: Scene) -> None:
+    """All of the picture is given off, as of an object without light."""
+    texture = surface(scene).pop("baseColorTexture", None)
+    surface(scene).update(baseColorFactor=[0, 0, 0, 1])
+    more = {"emissiveTexture": texture} if texture else {}
+    scene["materials"][0].update(emissiveFactor=[1, 1, 1], **more)
+
+
+def seen(alpha: float, mode: str, **more: float) -> Callable[[Scene], object]:
+    def change(scene: Scene) -> None:
+        surface(scene).update(baseColorFactor=[1, 0, 0, alpha])
+        scene["materials"][0].update(alphaMode=mode, **more)
+
+    return change
+
+
+def without_material(scene: Scene) -> None:
+    scene["meshes"][0]["primitives"][0].pop("material")
+
+
+@pytest.mark.parametrize(
+    ("mesh", "change", "expected"),
+    [
+        (plain, without_material, (255, 255, 255)),
+        (plain, seen(0.3, "BLEND"), (165, 89, 89)),
+        (plain, seen(0.3, "MASK"), (127, 127, 127)),
+        (plain, seen(0.5, "MASK"), (255, 0, 0)),
+        (plain, seen(0.8, "MASK", alphaCutoff=0.9), (127, 127, 127)),
+        (plain, seen(0.3, "OPAQUE"), (255, 0, 0)),
+        (body, glowing, (0, 0, 255)),  # it was black
+        (plain, glowing, (255, 255, 255)),
+        (body, stored(whole_png()), (90, 90, 90)),
+        (body, lambda s: s.update(scenes=[*s["scenes"], {"nodes": []}], scene=0), (0, 0, 255)),
+        (plain, posed(matrix=[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), (255, 255, 255)),
+    ],
+)
+def test_what_a_material_of_gltf_says_is_seen(
+    tmp_path: Path, mesh: Callable[[], trimesh.Trimesh], change: Callable[[Scene], object], expected
+) -> None:
+    found = colours(glb(tmp_path / "a.glb", mesh(), change))
+    assert np.abs(found.astype(int) - expected).max() <= 1
+
+
 REFUSED = [
     (draco, "uses KHR_draco_mesh_compression, which is not read here; export it again without"),
     (lambda s: s.update(extensionsUsed=["KHR_mesh_quantization"]), "KHR_mesh_quantization"),
     (lambda s: s.update(extensionsUsed=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
     (lambda s: s.update(extensionsUsed=["KHR_materials_pbrSpecularGlossiness"]), "Glossiness, wh"),
     (rotated, "turns a texture by KHR_texture_transform"),
+    (lambda s: s.update(extensionsUsed=["KHR_node_visibility"]), "uses KHR_node_visibility"),
+    (undeclared("nodes", "EXT_mesh_gpu_instancing"), "uses EXT_mesh_gpu_instancing"),
+    (undeclared("textures", "EXT_texture_webp"), "uses EXT_texture_webp"),
+    (undeclared("materials", "KHR_materials_pbrSpecularGlossiness"), "Glossiness, which"),
+    (lambda s: s["accessors"][0].update(sparse={"count": 1}), "uses sparse accessors"),
+    (posed(skin=0), "uses a skin"),
+    (posed(weights=[0.0, 1.0]), "uses weights of morph targets"),
+    (lambda s: s["meshes"][0]["primitives"][0].update(mode=6), "uses triangle fans"),
+    (lambda s: s["buffers"][0].update(uri="gone.bin"), "refers to 'gone.bin'"),
+    (lambda s: s["images"][0].update(uri="gone.png"), "refers to 'gone.png'"),
+    (lambda s: s["images"][0].update(uri="../../q.png"), "refers to '../../q.png'"),
+    (wrapped(33071), "clamps or mirrors a texture beyond its edge"),  # it was repeated
+    (wrapped(33648), "clamps or mirrors a texture beyond its edge"),
+    (lambda s: stored(whole_png()[:45])(s), "a texture cannot be read"),  # it was white
+    (lambda s: stored(whole_png(np.uint16))(s), "a texture has I;16 pixels"),
+    (factor(2, 0, 0, 1), "has a colour's factor outside 0..1"),
     (lambda s: surface(s)["baseColorTexture"].update(texCoord=3), "lacks .* TEXCOORD_3"),
 ]
 
@@ -197,27 +291,90 @@ def obj(folder: Path, material: str, name: str = "a") -> Path:
         "map_Kd -s 1 1 1 pictures/q.png",
         "map_Kd -clamp on -o 0 0 -s 1 1 1 pictures\\q.png",
         "Kd 0.8 0.8 0.8\nmap_Kd pictures/q.png",
+        'map_Kd "pictures/q.png"',
+        "map_Kd Pictures/Q.PNG",
+        "map_Kd \\\\server\\share\\q.png",
+        "map_Kd pictures/%71.png",
+        "map_Kd -mm 0 1 -blendu off pictures/q.png",
     ],
 )
 def test_a_picture_of_an_obj_is_found(tmp_path: Path, line: str) -> None:
     (tmp_path / "pictures").mkdir()
     picture = Image.fromarray(QUARTERS.repeat(8, 0).repeat(8, 1))
     picture.save(tmp_path / "pictures" / "q.png")
-    if "C:" in line:
+    if ":" in line or "server" in line or "Pictures" in line:
         picture.save(tmp_path / "q.png")
     assert colours(obj(tmp_path, line)).tolist() == [[0, 0, 255]]
 
 
-def test_kd_alone_colours_an_obj(tmp_path: Path) -> None:
-    assert colours(obj(tmp_path, "Kd 0.1 0.3 0.8")).tolist() == [[26, 76, 204]]
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("Kd 0.1 0.3 0.8", (26, 76, 204)),
+        ("Kd 0.5", (128, 128, 128)),
+        ("Kd 1 0 0\nd 0.3", (165, 89, 89)),
+        ("Kd 1 0 0\nTr 0.7", (165, 89, 89)),
+        ("Kd 0 0 0\nKe 1 0 0", (255, 0, 0)),
+    ],
+)
+def test_kd_alone_colours_an_obj(tmp_path: Path, lines: str, expected: tuple[int, ...]) -> None:
+    assert np.abs(colours(obj(tmp_path, lines)).astype(int) - expected).max() <= 1
+
+
+def test_the_vertices_of_an_obj_have_colours(tmp_path: Path) -> None:
+    """They were dropped where it has texture coordinates or a material."""
+    for material in ("Kd 1 1 1", ""):
+        path = obj(tmp_path, material)
+        lines = [
+            line + " 0.2 0.4 0.6" * line.startswith("v ") for line in path.read_text().split("\n")
+        ]
+        path.write_text("\n".join(line for line in lines if material or "mtl" not in line))
+        assert np.abs(colours(path).astype(int) - (51, 102, 153)).max() <= 1
+    path.write_text(path.read_text().replace("0.2 0.4 0.6", "51 102 153"))
+    with pytest.raises(BadObject, match=r"has vertex colours outside 0\.\.1"):
+        colours(path)
+
+
+def test_a_clamped_texture_of_an_obj_is_refused_beyond_its_edge(tmp_path: Path) -> None:
+    Image.fromarray(QUARTERS.repeat(8, 0).repeat(8, 1)).save(tmp_path / "q.png")
+    path = obj(tmp_path, "map_Kd -clamp on q.png")
+    assert colours(path).tolist() == [[0, 0, 255]]
+    path.write_text(path.read_text().replace("vt 0.25", "vt 1.25"))
+    with pytest.raises(BadObject, match="clamps or mirrors a texture beyond its edge"):
+        colours(path)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_picture_of_one_pixel_is_one(tmp_path: Path, size: int) -> None:
+    """It was taken for one that is missing: refused in an OBJ, white in a GLB."""
+    Image.new("RGB", (size, size), (10, 200, 30)).save(tmp_path / "q.png")
+    assert colours(obj(tmp_path, "map_Kd q.png")).tolist() == [[10, 200, 30]]
+    path = glb(tmp_path / "a.glb", body(), stored((tmp_path / "q.png").read_bytes()))
+    assert colours(path).tolist() == [[10, 200, 30]]
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_the_profile_of_a_texture(tmp_path: Path, kind: str) -> None:
+    """glTF says that textures are in sRGB whatever they declare; other formats say nothing."""
+    picture = Image.new("RGB", (8, 8), (180, 120, 90))
+    picture.save(tmp_path / "q.png", icc_profile=icc(np.array(SPACES["Display P3"][0]), 2.2))
+    path = obj(tmp_path, "map_Kd q.png")
+    if kind == "glb":
+        path = glb(tmp_path / "a.glb", body(), stored((tmp_path / "q.png").read_bytes()))
+    expected = (180, 120, 90) if kind == "glb" else (192, 117, 83)
+    assert np.abs(colours(path).astype(int) - expected).max() <= 1
 
 
 @pytest.mark.parametrize(
     ("line", "words"),
     [
         ("map_Kd missing.png", "refers to 'missing.png', and there is no such file beside it"),
-        ("map_Kd -s 2 2 1 q.png", "a texture that is moved or scaled .-s 2 2 1."),
+        ("map_Kd -s 2 2 1 q.png", "a texture is moved, scaled or brightened .-s 2 2 1."),
         ("Ns 10", "has no texture, UV map or vertex colours"),
+        ("map_Kd -mm 0.2 0.5 q.png", "moved, scaled or brightened .-mm 0.2 0.5."),
+        ("map_Kd ../q.png", "refers to '../q.png'"),
+        ("Kd 200 30 40", "has Kd outside 0..1"),
+        ("Kd nan 0 0", "has Kd outside 0..1"),
     ],
 )
 def test_what_an_obj_lacks_is_named(tmp_path: Path, line: str, words: str) -> None:
@@ -226,6 +383,31 @@ def test_what_an_obj_lacks_is_named(tmp_path: Path, line: str, words: str) -> No
     if "missing" in line:
         found = read_mesh_file(tmp_path / "a.obj", colour="#aa3322")
         assert np.unique(found.rgb, axis=0).tolist() == [[0xAA, 0x33, 0x22]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "cells", "words"),
+    [
+        ("uchar", "200 30 40", ""),
+        ("ushort", "51400 7710 10280", ""),
+        ("float", "0.7843 0.1176 0.1569", ""),
+        ("float", "200 30 40", "has colours in floats outside 0..1"),  # they were white
+        ("float", "nan 0 0", "has colours in floats outside 0..1"),
+    ],
+)
+def test_the_colours_of_a_ply(tmp_path: Path, kind: str, cells: str, words: str) -> None:
+    lines = ["ply", "format ascii 1.0", "element vertex 4"]
+    lines += [f"property float {name}" for name in ("x", "y", "z")]
+    lines += [f"property {kind} {name}" for name in ("red", "green", "blue")]
+    lines += ["element face 4", "property list uchar int vertex_indices", "end_header"]
+    lines += [f"{xyz} {cells}" for xyz in ("0 0 0", "0.1 0 0", "0 0.1 0", "0 0 0.1")]
+    lines += ["3 0 2 1", "3 0 1 3", "3 1 2 3", "3 0 3 2"]
+    (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
+    if words:
+        with pytest.raises(BadObject, match=words):
+            colours(tmp_path / "a.ply")
+    else:
+        assert np.abs(colours(tmp_path / "a.ply").astype(int) - (200, 30, 40)).max() <= 1
 
 
 def test_a_ply_without_its_picture_is_one_line(tmp_path: Path) -> None:
@@ -238,3 +420,9 @@ def test_a_ply_without_its_picture_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
     line = refused("objects", "import", tmp_path / "a.ply", "--category", "cup")
     assert "refers to 'label.png'" in line
+    lines.insert(2, "comment TextureFile other.png")
+    for name in ("label.png", "other.png"):
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
+    with pytest.raises(BadObject, match="has several textures; bake them into one"):
+        read_mesh_file(tmp_path / "a.ply")

@@ -1,28 +1,41 @@
 """A GLB file made plain for trimesh: colours in sRGB, one set of texture coordinates, no extension.
 
 glTF says factors and vertex colours in linear light, and multiplies both with the texture, which is
-in sRGB. trimesh hands on the numbers as they are, and ignores what else a file may say.
+in sRGB. trimesh hands on the numbers as they are, opens every picture itself, and ignores what else
+a file may say.
 """
 
 import json
 import re
 import struct
+from base64 import b64decode
+from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from vap_core.base.errors import BadObject
+from vap_core.base.errors import BadObject, BadPhoto
 from vap_core.base.files import parse_json
-from vap_core.base.media import to_linear, to_srgb
+from vap_core.base.media import BEHIND, decode_picture, to_linear, to_srgb
+from vap_core.base.types import Rgb
 
 TRANSFORM = "KHR_texture_transform"
+STRENGTH = "KHR_materials_emissive_strength"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
-HARMLESS = re.compile(r"KHR_(materials_\w+|lights_\w+|xmp\w*|animation_pointer|node_visibility)")
+HARMLESS = re.compile(r"KHR_(materials_\w+|lights_\w+|xmp\w*|animation_pointer)")
 """Extensions that change neither the form nor the base colour."""
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 UBYTE, FLOAT = 5121, 5126
+TRIANGLES, STRIP, FAN = 4, 5, 6
+REPEAT = 10497
+CLAMPED = (
+    "clamps or mirrors a texture beyond its edge, which is not read here; unwrap the mesh within "
+    "0..1"
+)
 
 
 def multiply(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -31,8 +44,34 @@ def multiply(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.asarray(np.round(255 * to_srgb(product)))
 
 
-def plain_glb(path: Path) -> bytes:
-    """The file with its factors and vertex colours in sRGB, and texture coordinates transformed.
+def shares(values: Any, path: Path, what: str) -> np.ndarray:
+    """Numbers of a colour. Raises: BadObject for one outside 0..1."""
+    found = np.atleast_1d(np.asarray(values, np.float64))
+    if not ((found >= 0) & (found <= 1)).all():
+        raise BadObject(
+            f"objects: {path} has {what} outside 0..1; export it again with colours as shares."
+        )
+    return found
+
+
+def outside(uv: np.ndarray) -> np.ndarray:
+    """Which texture coordinates lie beyond the picture's edge, by more than a hundredth."""
+    return (uv < -0.01) | (uv > 1.01)
+
+
+def as_bitmap(rgb: Rgb) -> bytes:
+    """A picture for trimesh, which reads one of 2 x 2 pixels as one that is missing."""
+    if max(rgb.shape[:2]) <= 2:
+        rgb = rgb.repeat(4, 0).repeat(4, 1)
+    whole = BytesIO()
+    Image.fromarray(rgb).save(whole, "BMP")
+    return whole.getvalue()
+
+
+def plain_glb(path: Path, find: Callable[[str], bytes]) -> bytes:
+    """The file with its colours in sRGB: of every part a factor, or an opaque picture.
+
+    `find` gives the bytes of a file beside it.
 
     Raises:
         BadObject: it says something that is not read here; the message names it.
@@ -43,24 +82,30 @@ def plain_glb(path: Path) -> bytes:
         raise BadObject(f"objects: {path} is no binary glTF 2 file; export it again as GLB.")
     scene = parse_json(data[20 : 20 + length])
     blob = bytearray(data[28 + length :])
-    _refuse_extensions(path, scene)
-    materials = scene.get("materials", [])
-    for material in materials:
-        surface = material.setdefault("pbrMetallicRoughness", {})
-        *rgb, alpha = surface.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
-        surface["baseColorFactor"] = [*to_srgb(np.array(rgb, float)).tolist(), alpha]
+    _refuse_unread(path, scene)
+    given, sources = scene.get("materials", []), dict(scene)
+    scene |= {"materials": [], "textures": [], "images": []}
+    scene.setdefault("bufferViews", [])
+    known: dict[str, int] = {}
     for mesh in scene.get("meshes", []):
         for part in mesh["primitives"]:
+            if part.get("mode", TRIANGLES) not in (TRIANGLES, STRIP):
+                continue
             attributes = part["attributes"]
             if "COLOR_0" in attributes:
                 colours = _read(path, scene, blob, attributes["COLOR_0"])
                 rgba = np.ones((len(colours), 4))
-                rgba[:, : colours.shape[1]] = colours
+                rgba[:, : colours.shape[1]] = shares(colours, path, "vertex colours")
                 rgba[:, :3] = to_srgb(rgba[:, :3])
                 rows = np.round(255 * rgba).astype(np.uint8)
                 attributes["COLOR_0"] = _append(scene, blob, rows, UBYTE, normalized=True)
-            if "material" in part:
-                _place_texture(path, scene, blob, attributes, materials[part["material"]])
+            material = given[part["material"]] if "material" in part else {}
+            _place_texture(path, scene, blob, attributes, material, sources)
+            about = json.dumps({**material, "name": "", "doubleSided": False}, sort_keys=True)
+            if about not in known:
+                known[about] = len(scene["materials"])
+                scene["materials"].append(_plain(path, scene, blob, material, sources, find))
+            part["material"] = known[about]
     blob += bytes(-len(blob) % 4)
     if scene.get("buffers"):
         scene["buffers"][0]["byteLength"] = len(blob)
@@ -71,10 +116,24 @@ def plain_glb(path: Path) -> bytes:
     return whole + struct.pack("<II", len(blob), 0x004E4942) + bytes(blob)
 
 
-def _refuse_extensions(path: Path, scene: dict[str, Any]) -> None:
-    """Raises: BadObject for one that changes the form or the base colour."""
-    named = {*scene.get("extensionsUsed", []), *scene.get("extensionsRequired", [])} - {TRANSFORM}
-    unread = sorted(name for name in named if name == GLOSSY or not HARMLESS.fullmatch(name))
+def _refuse_unread(path: Path, scene: dict[str, Any]) -> None:
+    """Raises: BadObject for what changes the form or the base colour, and is not read here."""
+    named = {*scene.get("extensionsUsed", []), *scene.get("extensionsRequired", [])}
+    named |= set(_extensions(scene))
+    unread = sorted(
+        name for name in named - {TRANSFORM} if name == GLOSSY or not HARMLESS.fullmatch(name)
+    )
+    meshes, nodes = scene.get("meshes", []), scene.get("nodes", [])
+    placed = [(node, meshes[node["mesh"]]) for node in nodes if "mesh" in node]
+    parts = [part for mesh in meshes for part in mesh["primitives"]]
+    if any("sparse" in accessor for accessor in scene.get("accessors", [])):
+        unread.append("sparse accessors")
+    if any("skin" in node for node, _ in placed):
+        unread.append("a skin (apply the armature)")
+    if any(any(node.get("weights") or mesh.get("weights") or ()) for node, mesh in placed):
+        unread.append("weights of morph targets (apply the shape keys)")
+    if any(part.get("mode") == FAN for part in parts):
+        unread.append("triangle fans")
     if unread:
         raise BadObject(
             f"objects: {path} uses {', '.join(unread)}, which is not read here; export it again "
@@ -82,37 +141,161 @@ def _refuse_extensions(path: Path, scene: dict[str, Any]) -> None:
         )
 
 
+def _extensions(part: Any) -> Iterator[str]:
+    """The extensions that a part of a file has, declared or not."""
+    if isinstance(part, dict):
+        yield from part.get("extensions", {})
+    for inner in part.values() if isinstance(part, dict) else part:
+        if isinstance(inner, dict | list):
+            yield from _extensions(inner)
+
+
+def _plain(
+    path: Path,
+    scene: dict[str, Any],
+    blob: bytearray,
+    material: dict[str, Any],
+    sources: dict[str, Any],
+    find: Callable[[str], bytes],
+) -> dict[str, Any]:
+    """A material of one factor or one opaque picture in sRGB.
+
+    What it gives off is added to its base colour. Grey stands behind what is transparent, as in
+    photos, unless the material says that it is opaque.
+    """
+    surface = material.get("pbrMetallicRoughness", {})
+    factor = shares(surface.get("baseColorFactor", [1.0] * 4), path, "a colour's factor")
+    glow = np.array(material.get("emissiveFactor", [0.0] * 3), np.float64)
+    glow = glow * material.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0)
+    rgba = _picture(path, sources, blob, surface.get("baseColorTexture"), find)
+    light = None
+    if glow.any():
+        shine = _picture(path, sources, blob, material.get("emissiveTexture"), find)
+        if shine is not None and rgba is not None:
+            shine = np.array(Image.fromarray(shine).resize(rgba.shape[1::-1]))
+        elif shine is not None:
+            rgba = np.full_like(shine, 255)
+        if rgba is None:
+            light = np.minimum(factor[:3] + glow, 1)
+        else:
+            table = to_linear(np.arange(256) / 255).astype(np.float32)
+            bright = 1 if shine is None else table[shine[..., :3]]
+            sum_ = table[rgba[..., :3]] * factor[:3].astype("f4") + bright * glow.astype("f4")
+            rgba = np.concatenate(
+                [np.round(255 * to_srgb(sum_)).astype(np.uint8), rgba[..., 3:]], axis=2
+            )
+            factor[:3] = 1
+    mode, alpha = material.get("alphaMode", "OPAQUE"), factor[3]
+    if rgba is None:
+        colour = to_srgb(factor[:3] if light is None else light)
+        if mode == "MASK":
+            alpha = float(alpha >= material.get("alphaCutoff", 0.5))
+        alpha = 1 if mode == "OPAQUE" else alpha
+        colour = alpha * colour + (1 - alpha) * BEHIND / 255
+        return {"pbrMetallicRoughness": {"baseColorFactor": [*colour.tolist(), 1.0]}}
+    levels = multiply(np.arange(256)[:, None], 255 * to_srgb(factor[:3])).astype(np.uint8)
+    rgb = np.stack([levels[rgba[..., i], i] for i in range(3)], axis=2)
+    if mode != "OPAQUE":
+        seen = rgba[..., 3] * alpha
+        if mode == "MASK":
+            seen = 255.0 * (seen >= 255 * material.get("alphaCutoff", 0.5))
+        opacity = np.round(seen).astype(np.uint8)
+        grey = Image.new("RGB", rgba.shape[1::-1], (BEHIND,) * 3)
+        rgb = np.array(Image.composite(Image.fromarray(rgb), grey, Image.fromarray(opacity)))
+    blob += bytes(-len(blob) % 4)
+    bitmap = as_bitmap(rgb)
+    view = {"buffer": 0, "byteOffset": len(blob), "byteLength": len(bitmap)}
+    blob += bitmap
+    scene["bufferViews"].append(view)
+    image = {"bufferView": len(scene["bufferViews"]) - 1, "mimeType": "image/bmp"}
+    scene["images"].append(image)
+    scene["textures"].append({"source": len(scene["images"]) - 1})
+    texture = {"index": len(scene["textures"]) - 1}
+    return {"pbrMetallicRoughness": {"baseColorTexture": texture}}
+
+
+def _picture(
+    path: Path,
+    sources: dict[str, Any],
+    blob: bytearray,
+    texture: dict[str, Any] | None,
+    find: Callable[[str], bytes],
+) -> np.ndarray | None:
+    """The pixels of a texture, h x w x 4; None where there is none. Raises: BadObject."""
+    if texture is None:
+        return None
+    image = sources["images"][sources["textures"][texture["index"]]["source"]]
+    uri = image.get("uri", "")
+    if uri.startswith("data:"):
+        data = b64decode(uri.partition(",")[2])
+    elif uri:
+        try:
+            data = find(uri)
+        except FileNotFoundError:  # `find` has taken note of it
+            return None
+    else:
+        view = sources["bufferViews"][image["bufferView"]]
+        start = view.get("byteOffset", 0)
+        data = bytes(blob[start : start + view["byteLength"]])
+    try:
+        return decode_picture(
+            BytesIO(data), f"objects: {path}: a texture", "RGBA", upright=False, convert=False
+        )
+    except BadPhoto as error:
+        raise BadObject(str(error)) from error
+
+
 def _place_texture(
-    path: Path, scene: dict[str, Any], blob: bytearray, attributes: dict[str, int], material: Any
+    path: Path,
+    scene: dict[str, Any],
+    blob: bytearray,
+    attributes: dict[str, int],
+    material: dict[str, Any],
+    sources: dict[str, Any],
 ) -> None:
     """Give a part the texture coordinates of its base colour, moved and scaled, as the first."""
-    texture = material["pbrMetallicRoughness"].get("baseColorTexture")
-    if texture is None:
+    textures = [material.get("pbrMetallicRoughness", {}).get("baseColorTexture")]
+    if any(material.get("emissiveFactor", ())):
+        textures.append(material.get("emissiveTexture"))
+    used = [texture for texture in textures if texture is not None]
+    if not used:
         return
-    transform = texture.get("extensions", {}).get(TRANSFORM, {})
-    number = transform.get("texCoord", texture.get("texCoord", 0))
+    transform, *others = [texture.get("extensions", {}).get(TRANSFORM, {}) for texture in used]
+    number, *numbers = [
+        each.get("texCoord", texture.get("texCoord", 0))
+        for each, texture in zip([transform, *others], used, strict=True)
+    ]
     name = f"TEXCOORD_{number}"
+    fault = ""
     if transform.get("rotation"):
+        fault = f"turns a texture by {TRANSFORM}"
+    elif any(each != transform for each in others) or any(each != number for each in numbers):
+        fault = "places its emissive texture otherwise than its base colour"
+    if fault:
         raise BadObject(
-            f"objects: {path} turns a texture by {TRANSFORM}, which is not read here; apply it in "
-            "your 3-D tool."
+            f"objects: {path} {fault}, which is not read here; apply it in your 3-D tool."
         )
     if name not in attributes:
         raise BadObject(
             f"objects: {path} lacks the texture coordinates {name} that a material names; unwrap "
             "the mesh and export it again."
         )
-    if transform or number:
+    sampler = sources["textures"][used[0]["index"]].get("sampler")
+    wraps = {} if sampler is None else sources["samplers"][sampler]
+    repeats = np.array([wraps.get(axis, REPEAT) == REPEAT for axis in ("wrapS", "wrapT")])
+    if transform or number or not repeats.all():
         uv = _read(path, scene, blob, attributes[name])
         uv = uv * transform.get("scale", [1, 1]) + transform.get("offset", [0, 0])
+        if (outside(uv) & ~repeats).any():
+            raise BadObject(f"objects: {path} {CLAMPED}.")
         attributes["TEXCOORD_0"] = _append(scene, blob, uv.astype("<f4"), FLOAT)
 
 
 def _read(path: Path, scene: dict[str, Any], blob: bytearray, number: int) -> np.ndarray:
     """The numbers of an accessor, a row each; integers as shares of their largest."""
     accessor = scene["accessors"][number]
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise BadObject(f"objects: {path} has sparse accessors; export it again without.")
+    if "bufferView" not in accessor:
+        raise BadObject(f"objects: {path} has an accessor without numbers; export it again.")
     view = scene["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") or "uri" in scene["buffers"][0]:
         raise BadObject(f"objects: {path} keeps its numbers in another file; export it as one GLB.")

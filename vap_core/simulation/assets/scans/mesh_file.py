@@ -5,27 +5,35 @@ packed, and every texel gets the colour of the nearest coloured point.
 """
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image, ImageColor, UnidentifiedImageError
+from PIL import ImageColor
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from vap_core.base.errors import BadObject
-from vap_core.base.media import BEHIND, MAX_PIXELS, PICTURE_FORMATS
+from vap_core.base.errors import BadObject, BadPhoto
+from vap_core.base.media import BEHIND, HEAD_BYTES, decode_picture
 from vap_core.base.types import Rgb, value
-from vap_core.simulation.assets.scans.gltf import multiply, plain_glb
+from vap_core.simulation.assets.scans.gltf import (
+    CLAMPED,
+    as_bitmap,
+    multiply,
+    outside,
+    plain_glb,
+    shares,
+)
 from vap_core.simulation.assets.shapes import Faces, Mesh, Vertices, area_vectors
 
 if TYPE_CHECKING:
     import trimesh
-    from trimesh.resolvers import FilePathResolver
 
 SUFFIXES = (".glb", ".obj", ".ply", ".stl")
 MAX_MB, MAX_FACES = 200, 500_000
@@ -122,13 +130,19 @@ def _load_parts(path: Path, colour: str | None) -> "list[trimesh.Trimesh]":
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
-    source = BytesIO(plain_glb(path)) if kind == "glb" else path
     missing: list[str] = []
-    with _checked_pictures() as refused, _silent():
-        resolver = _beside(path, missing, refused)
-        scene = trimesh.load_scene(source, file_type=kind, resolver=resolver)
+    refused: list[str] = []
+    resolver = _beside(path, missing, refused)
+    try:
+        source = BytesIO(plain_glb(path, resolver.raw)) if kind == "glb" else path
+        with _silent():
+            scene = trimesh.load_scene(source, file_type=kind, resolver=resolver)
+    except FileNotFoundError:
+        if not missing:
+            raise
+        colour = None  # the numbers themselves are missing
     if refused:
-        raise BadObject(f"objects: {path} has a texture that {refused[0]}.")
+        raise BadObject(f"objects: {path}: {refused[0]}.")
     if missing and colour is None:
         raise BadObject(
             f"objects: {path} refers to {missing[0]!r}, and there is no such file beside it; put "
@@ -142,6 +156,9 @@ def _load_parts(path: Path, colour: str | None) -> "list[trimesh.Trimesh]":
     for mesh in meshes.values():
         face, points = np.asarray(mesh.faces), len(mesh.vertices)
         uv = getattr(mesh.visual, "uv", None)
+        if resolver.clamped and uv is not None and outside(uv).any():
+            raise BadObject(f"objects: {path} {CLAMPED}.")
+        _check_ply_colours(path, mesh)
         if face.ndim != 2 or face.shape[1] != 3 or face.min() < 0 or face.max() >= points:
             raise BadObject(
                 f"objects: {path} has faces that name vertices that are not there; export it again."
@@ -166,38 +183,103 @@ def _load_parts(path: Path, colour: str | None) -> "list[trimesh.Trimesh]":
         copied: Any = part.visual
         if "color" in getattr(loaded, "vertex_attributes", {}):  # a copy forgets it
             copied.vertex_attributes["color"] = loaded.vertex_attributes["color"]
+    if kind == "obj" and colour is None:
+        _colour_obj(path, parts)
     return parts
 
 
-def _beside(path: Path, missing: list[str], refused: list[str]) -> "FilePathResolver":
+def _colour_obj(path: Path, parts: "list[trimesh.Trimesh]") -> None:
+    """Give the vertices of an OBJ their colours, which trimesh drops where it finds a material."""
+    lines = path.read_text(errors="replace").splitlines()
+    rows = [line.split()[1:7] for line in lines if line.startswith("v ")]
+    if not rows or any(len(row) < 6 for row in rows):
+        return
+    numbers = np.array(rows, np.float64)
+    rgb = 255 * shares(numbers[:, 3:], path, "vertex colours")
+    tree = cKDTree(numbers[:, :3])
+    for part in parts:
+        visual: Any = part.visual
+        if hasattr(visual, "vertex_attributes"):
+            visual.vertex_attributes["color"] = rgb[tree.query(part.vertices)[1]]
+
+
+def _check_ply_colours(path: Path, mesh: "trimesh.Trimesh") -> None:
+    """Raises: BadObject for several textures, of which trimesh takes one, and for colours in floats
+    that are no shares, which it cuts off."""
+    raw: Any = mesh.metadata.get("_ply_raw", {})
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES).partition(b"end_header")[0]
+    if raw and head.count(b"TextureFile") > 1:
+        raise BadObject(f"objects: {path} has several textures; bake them into one.")
+    for element in ("vertex", "face"):
+        cells = raw.get(element, {}).get("data", {})
+        names = cells.dtype.names or () if isinstance(cells, np.ndarray) else cells
+        for channel in ("red", "green", "blue"):
+            if channel in names:
+                column = np.asarray(cells[channel])
+                if column.dtype.kind == "f":
+                    shares(column, path, "colours in floats")
+
+
+def _beside(path: Path, missing: list[str], refused: list[str]) -> Any:
     """Opens what the mesh refers to: regular files in its folder and below, of MAX_MB at most.
 
-    What is not there is added to `missing`, what is not read here to `refused`.
+    A picture comes decoded, as a bitmap. What is not there is added to `missing`, what is not read
+    here to `refused`.
     """
     from trimesh.resolvers import FilePathResolver
 
     class Bounded(FilePathResolver):
-        def get(self, name: str) -> bytes:
-            named = _without_options(name.strip(), refused).replace("\\", "/")
-            for candidate in (named, Path(named).name):
+        clamped = False
+
+        def raw(self, name: str) -> bytes:
+            named = name.strip().strip('"').replace("\\", "/")
+            whole = [named, unquote(named)]
+            for candidate in dict.fromkeys([*whole, *(Path(each).name for each in whole)]):
                 with suppress(ValueError):  # outside the folder
-                    found = self.absolute(candidate)
+                    found = _any_case(Path(self.absolute(candidate)))
                     if found.is_file() and found.stat().st_size <= MAX_MB * 1e6:
                         return found.read_bytes()
             missing.append(named)
             raise FileNotFoundError(named)
 
+        def get(self, name: str) -> bytes:
+            if path.suffix.lower() == ".glb":
+                return self.raw(name)
+            if name.strip().lower().endswith(".mtl"):
+                return ONE_LEVEL.sub(rb"\1 \2 \2 \2", self.raw(name))
+            self.clamped |= " -clamp on " in f" {name} "
+            named = _without_options(name.strip(), refused)
+            data = BytesIO(self.raw(named))
+            try:
+                return as_bitmap(decode_picture(data, f"the texture {named!r}", upright=False))
+            except BadPhoto as error:
+                refused.append(str(error).removesuffix("."))
+                raise
+
     return Bounded(str(path))
 
 
+def _any_case(path: Path) -> Path:
+    """The file of that name; where there is none, one that differs in case, as on Windows."""
+    if not path.is_file() and path.parent.is_dir():
+        for other in path.parent.iterdir():
+            if other.name.lower() == path.name.lower():
+                return other
+    return path
+
+
+ONE_LEVEL = re.compile(rb"^(\s*K[ade])\s+([\d.]+)\s*$", re.IGNORECASE | re.MULTILINE)
+"""A line of an .mtl file with one level for red, green and blue, which trimesh does not read."""
 MAP_OPTIONS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 """How many numbers follow an option of a picture in an .mtl file, at most; one word else."""
+UNMOVED = {"-s": (1, 1, 1), "-o": (0, 0, 0), "-t": (0, 0, 0), "-mm": (0, 1)}
 
 
 def _without_options(name: str, refused: list[str]) -> str:
     """The file in a line of an .mtl file such as "-s 1 1 1 -clamp on label.png".
 
-    A texture that is moved or scaled is added to `refused`.
+    A texture that is moved, scaled, clamped or brightened is added to `refused`.
     """
     words = name.split()
     while len(words) > 1 and words[0].startswith("-"):
@@ -205,11 +287,12 @@ def _without_options(name: str, refused: list[str]) -> str:
         values = [words.pop(0)]
         while len(values) < MAP_OPTIONS.get(option, 1) and len(words) > 1 and _is_number(words[0]):
             values.append(words.pop(0))
-        unmoved = {"-s": 1.0, "-o": 0.0, "-t": 0.0}.get(option)
-        if unmoved is not None and any(float(value) != unmoved for value in values):
+        numbers = UNMOVED.get(option, ())
+        moved = [float(value) for value in values if numbers] != list(numbers[: len(values)])
+        if moved:
             refused.append(
-                f"is moved or scaled ({option} {' '.join(values)}), which is not read here; apply "
-                "it in your 3-D tool"
+                f"a texture is moved, scaled or brightened ({option} {' '.join(values)}), which is "
+                "not read here; apply it in your 3-D tool"
             )
         name = " ".join(words)
     return name
@@ -233,38 +316,6 @@ def _silent() -> Iterator[None]:
         logging.disable(before)
 
 
-@contextmanager
-def _checked_pictures() -> Iterator[list[str]]:
-    """Inside the block Pillow opens PICTURE_FORMATS up to MAX_PIXELS alone, whoever calls it.
-
-    The readers of meshes open textures themselves, and go on without those that fail. The list
-    says what was wrong with each.
-    """
-    unchecked = Image.open
-    refused = []
-    most = f"over {MAX_PIXELS / 1e6:.0f} million"
-
-    def checked(file: Any, *_: Any, **__: Any) -> Image.Image:
-        try:
-            image = unchecked(file, formats=PICTURE_FORMATS)
-        except UnidentifiedImageError:
-            refused.append(f"is none of {', '.join(PICTURE_FORMATS)}; save it as JPEG or PNG")
-            raise
-        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-            refused.append(f"has {most} pixels; shrink it")
-            raise
-        if image.width * image.height > MAX_PIXELS:
-            refused.append(f"has {image.width}x{image.height} pixels, {most}; shrink it")
-            raise Image.DecompressionBombError(refused[-1])
-        return image
-
-    Image.open = checked  # type: ignore[assignment]
-    try:
-        yield refused
-    finally:
-        Image.open = unchecked
-
-
 def weld(
     corner: Float[np.ndarray, "f 3 3"],
 ) -> tuple[Vertices, Int[np.ndarray, "k 3"], Bool[np.ndarray, " f"]]:
@@ -282,25 +333,32 @@ def weld(
 
 
 def _texture_picture(visual: Any) -> Rgb | None:
-    """The texture of a part with texture coordinates, times its material's factor.
+    """The texture of a part with texture coordinates, as `plain_glb` or `_beside` decoded it.
 
-    Grey stands behind what is transparent, as in photos, unless the material says that it is
-    opaque. A texture of 2 x 2 pixels only stands in for a missing file and does not count.
+    A texture of 2 x 2 pixels only stands in for a missing file and does not count.
     """
     material: Any = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or getattr(visual, "uv", None) is None or max(image.size) <= 2:
         return None
-    opaque = hasattr(material, "baseColorTexture") and material.alphaMode in (None, "OPAQUE")
-    if image.has_transparency_data and not opaque:
-        grey = Image.new("RGBA", image.size, (BEHIND, BEHIND, BEHIND, 255))
-        image = Image.alpha_composite(grey, image.convert("RGBA"))
-    rgb = image.convert("RGB")
-    factor = getattr(material, "baseColorFactor", None)
-    if factor is not None:
-        table = multiply(np.arange(256), np.asarray(factor)[:3, None])
-        rgb = rgb.point(table.astype(np.uint8).ravel().tolist())
-    return np.array(rgb)
+    return np.array(image.convert("RGB"))
+
+
+def _diffuse(path: Path, words: dict[str, Any]) -> np.ndarray | None:
+    """Kd of an .mtl file and what it gives off, 0 to 255, over grey where it is transparent."""
+    kd, glow = words.get("kd"), words.get("ke") or ()
+    if kd is None:
+        return None
+    rgb = np.broadcast_to(shares(kd, path, "Kd"), 3)
+    if any(map(_is_number, glow)):
+        rgb = np.minimum(rgb + np.array(glow, np.float64), 1)
+    opacity = 1.0
+    if "d" in words:
+        opacity = float(words["d"][-1])
+    elif "tr" in words:
+        opacity = 1 - float(words["tr"][-1])
+    seen = shares(opacity, path, "d or Tr")
+    return np.round(255 * seen * rgb + (1 - seen) * BEHIND)
 
 
 def _sample_colours(
@@ -332,7 +390,7 @@ def _sample_colours(
     first = 0
     for part in parts:
         mine = (triangle >= first) & (triangle < first + len(part.faces))
-        found = _colours(part, triangle[mine] - first, share[mine])
+        found = _colours(path, part, triangle[mine] - first, share[mine])
         if found is None:
             hint = ""
             if path.suffix.lower() == ".obj":
@@ -347,12 +405,12 @@ def _sample_colours(
 
 
 def _colours(
-    part: "trimesh.Trimesh", triangle: Int[np.ndarray, " n"], share: Float[np.ndarray, "n 3"]
+    path: Path,
+    part: "trimesh.Trimesh",
+    triangle: Int[np.ndarray, " n"],
+    share: Float[np.ndarray, "n 3"],
 ) -> np.ndarray | None:
-    """By a part's texture, its vertices, or its material, at points with barycentric `share`s.
-
-    glTF multiplies them; in other formats the first that is there holds.
-    """
+    """By a part's texture or material, times its vertices', at points with barycentric `share`s."""
     visual: Any = part.visual
     corner = np.asarray(part.faces)[triangle]
     material: Any = getattr(visual, "material", None)
@@ -370,8 +428,8 @@ def _colours(
         texel = picture[row, np.floor(u % 1 * cols).astype(int) % cols]
         return texel if painted is None else multiply(texel, painted)
     flat = getattr(material, "baseColorFactor", None)
-    if flat is None and "kd" in getattr(material, "kwargs", {}):
-        flat = material.diffuse
+    if flat is None:
+        flat = _diffuse(path, getattr(material, "kwargs", {}))
     if flat is None:
         return painted
     flat = np.broadcast_to(np.asarray(flat)[:3], (len(triangle), 3))

@@ -22,6 +22,7 @@ from PIL import Image
 
 from vap_core.base.errors import BadObject, BadOutput, UnknownName
 from vap_core.base.files import parse_json, remove_scratch
+from vap_core.base.media import decode_picture
 from vap_core.base.types import Rgb, value
 from vap_core.simulation.assets.shapes import Hull, Mesh
 
@@ -223,15 +224,10 @@ def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
     return tuple(Hull(arrays[f"{n}.vertex"], float(arrays[f"{n}.volume"])) for n in names)
 
 
-def _decode_picture(data: bytes) -> Rgb:
-    with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
-        return np.array(picture.convert("RGB"))
-
-
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     MESH_FILE: _decode_mesh,
     HULLS_FILE: _decode_hulls,
-    TEXTURE_FILE: _decode_picture,
+    TEXTURE_FILE: lambda data: decode_picture(io.BytesIO(data), TEXTURE_FILE, formats=("PNG",)),
 }
 
 
