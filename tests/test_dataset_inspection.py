@@ -1,18 +1,23 @@
 """A recorded LeRobotDataset is grounded, tracked, recorded and copied; what it lacks is one line."""
 
 import json
+import os
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from tests.command import refused, vap
 from tests.full_disk import full_disk
+from tests.scanned import EPS
+from tests.test_media import LISTS, claims, film
 from tests.toys import TOYS, SameColour, personal, scene
 from vap_core import memory
 from vap_core.attend import Attender
@@ -296,6 +301,91 @@ def test_what_is_no_dataset_is_one_line(recorded: Path, tmp_path: Path, flaw: st
         open_dataset(folder)
     assert "\n" not in str(refusal.value)
     assert str(folder) in str(refusal.value)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An episode of one camera as a video."""
+    folder = tmp_path_factory.mktemp("datasets") / "filmed"
+    shape = scene([]).shape
+    feature = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
+    features = {"observation.images.top": feature}
+    dataset = LeRobotDataset.create("me/filmed", fps=5, features=features, root=folder)
+    for t in range(3):
+        dataset.add_frame({"observation.images.top": picture(t, "top", 0), "task": "bring it"})
+    dataset.save_episode()
+    dataset.finalize()
+    assert len(list(open_dataset(folder).frames(0))) == 3
+    return folder
+
+
+def elsewhere(folder: Path) -> None:
+    info = folder / "meta" / "info.json"
+    about = json.loads(info.read_text())
+    beside = "../out/{video_key}-{chunk_index}-{file_index}.mp4"
+    info.write_text(json.dumps({**about, "video_path": beside}))
+    (folder.parent / "out").mkdir()
+    found = next((folder / "videos").rglob("*.mp4"))
+    found.rename(folder.parent / "out" / "observation.images.top-0-0.mp4")
+
+
+def instead(made: Callable[[Path], object]) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        path = next((folder / "videos").rglob("*.mp4"))
+        path.unlink()
+        made(path)
+
+    return change
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (instead(lambda path: film(path, 4096, "libx264", preset="ultrafast")), "4096x4096 pixels"),
+        (instead(lambda path: path.write_text(LISTS["ffconcat"]("pipe"))), "cannot be decoded"),
+        (instead(lambda path: path.write_text(LISTS["m3u8"]("pipe"))), "cannot be decoded"),
+        (instead(os.mkfifo), "is not a file"),
+        (instead(lambda path: path.symlink_to("/dev/zero")), "is not a file"),
+        (instead(lambda path: path.write_bytes(b"")), "cannot be decoded"),
+        (elsewhere, "lies outside of the dataset"),
+    ],
+)
+def test_a_video_of_a_dataset_has_the_limit_of_clips(
+    filmed: Path, tmp_path: Path, change: Callable[[Path], None], words: str
+) -> None:
+    folder = shutil.copytree(filmed, tmp_path / "copy")
+    os.mkfifo(tmp_path / "pipe")
+    change(folder)
+    with pytest.raises(BadDataset, match=words) as refusal:
+        list(open_dataset(folder).frames(0))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "path", "words"),
+    [
+        (claims(8000), None, "pixels, over 50 million"),
+        (EPS, None, "cannot be read as an image, it is none of"),
+        (b"", None, "cannot be read as an image"),
+        (None, "/etc/hostname", "lies outside of the dataset"),
+        (None, "hf://datasets/a/b/c.png", "cannot be read"),
+        (None, "../x.png", "lies outside of the dataset"),
+    ],
+)
+def test_a_picture_of_a_dataset_has_the_limit_of_photos(
+    recorded: Path, tmp_path: Path, data: bytes | None, path: str | None, words: str
+) -> None:
+    folder = shutil.copytree(recorded, tmp_path / "copy")
+    (file,) = (folder / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    name = "observation.images.top"
+    cells = [{"bytes": data, "path": path}] * len(table)
+    column = pa.array(cells, table[name].type)
+    pq.write_table(table.set_column(table.column_names.index(name), name, column), file)
+    with pytest.raises(BadDataset, match=words) as refusal:
+        list(open_dataset(folder).frames(0))
+    assert "\n" not in str(refusal.value)
 
 
 def test_two_features_of_one_camera_are_refused(tmp_path: Path) -> None:

@@ -115,30 +115,41 @@ def decode_picture(
 
     Raises: BadPhoto: no picture of these formats, damaged, over MAX_PIXELS, or of more than 8 bits.
     """
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, ImageOps
+
+    head = source.read(HEAD_BYTES)
+    with opened_picture(source, name, formats) as image:
+        if image.mode.startswith(("I", "F")):
+            raise BadPhoto(
+                f"{name} has {image.mode} pixels, more than 8 bits each; save it as an 8-bit JPEG "
+                "or PNG."
+            )
+        space = _declared_space(image, head, name) if convert else None
+        found = ImageOps.exif_transpose(image) if upright else image
+        found = _in_srgb(found, space) if convert else found
+        if mode == "RGB" and found.has_transparency_data:
+            # What is hidden in the file is no part of the picture.
+            grey = Image.new("RGBA", found.size, (BEHIND, BEHIND, BEHIND, 255))
+            found = Image.alpha_composite(grey, found.convert("RGBA"))
+        return np.array(found.convert(mode), dtype=np.uint8)
+
+
+@contextmanager
+def opened_picture(
+    source: BytesIO | BufferedReader, name: str, formats: tuple[str, ...] = PICTURE_FORMATS
+) -> "Iterator[Image.Image]":
+    """Inside, a picture of these formats and of MAX_PIXELS at most is read. Raises: BadPhoto."""
+    from PIL import Image, UnidentifiedImageError
 
     over = f"pixels, over {MAX_PIXELS / 1e6:.0f} million; scale it down."
     try:
-        head = source.read(HEAD_BYTES)
         with (
             warnings.catch_warnings(action="ignore"),  # of Pillow, at what is damaged or large
             Image.open(source, formats=formats) as image,
         ):
             if image.width * image.height > MAX_PIXELS:
                 raise BadPhoto(f"{name} has {image.width}x{image.height} {over}")
-            if image.mode.startswith(("I", "F")):
-                raise BadPhoto(
-                    f"{name} has {image.mode} pixels, more than 8 bits each; save it as an 8-bit "
-                    "JPEG or PNG."
-                )
-            space = _declared_space(image, head, name) if convert else None
-            found = ImageOps.exif_transpose(image) if upright else image
-            found = _in_srgb(found, space) if convert else found
-            if mode == "RGB" and found.has_transparency_data:
-                # What is hidden in the file is no part of the picture.
-                grey = Image.new("RGBA", found.size, (BEHIND, BEHIND, BEHIND, 255))
-                found = Image.alpha_composite(grey, found.convert("RGBA"))
-            return np.array(found.convert(mode), dtype=np.uint8)
+            yield image
     except BadPhoto:
         raise
     except UnidentifiedImageError as error:
@@ -290,7 +301,7 @@ def _in_srgb(image: "Image.Image", space: Space | None) -> "Image.Image":
     """
     from PIL import Image, ImageCms
 
-    profile = image.info.get("icc_profile")
+    profile: Any = image.info.get("icc_profile")
     if space is None and not profile:
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
@@ -365,7 +376,7 @@ def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
     Raises: BadPhoto: the file is missing, unreadable, over MAX_VIDEO_PIXELS, or holds no video
         that can be decoded.
     """
-    with _opened(path) as container:
+    with opened_video(path) as container:
         codec = container.streams.video[0].codec_context
         space = _space_of(codec.color_primaries, codec.color_trc, f"video: {path}")
         for number, frame in enumerate(container.decode(video=0)):
@@ -376,7 +387,7 @@ def frames(path: Path, long_side: int | None = None) -> Iterator[Rgb]:
 
 
 @contextmanager
-def _opened(path: Path) -> "Iterator[av.container.InputContainer]":
+def opened_video(path: Path) -> "Iterator[av.container.InputContainer]":
     """Inside, a video of one of CONTAINERS is read. Raises: BadPhoto."""
     import av
 
@@ -518,7 +529,7 @@ class Mp4:
 
 def frame_rate(path: Path) -> float:
     """Frames a second of a video. Raises: BadPhoto."""
-    with _opened(path) as container:
+    with opened_video(path) as container:
         return float(container.streams.video[0].average_rate or USUAL_HZ)
 
 
@@ -541,7 +552,7 @@ def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:
         src_color_range=frame.color_range,
         dst_color_range=ColorRange.JPEG,
     )
-    matrix = frame.side_data.get("DISPLAYMATRIX")
+    matrix: Any = frame.side_data.get("DISPLAYMATRIX")
     a, b, _, c, d = np.frombuffer(matrix or struct.pack("=5i", 1, 0, 0, 0, 1), np.int32, 5).tolist()
     if abs(b) > abs(a):  # columns become rows
         rgb, a, d = rgb.transpose(1, 0, 2), c, b

@@ -496,19 +496,22 @@ def _read_video(
     """The pictures of one camera in an episode."""
     from lerobot.datasets.video_utils import decode_video_frames
 
+    from vap_core.policies.lerobot.datasets import bounded
+
     video = f"videos/{IMAGES}{camera}"
     chunk = f"chunk-{row[f'{video}/chunk_index']:03d}"
     file = f"file-{row[f'{video}/file_index']:03d}.mp4"
     times = []
     for t in range(0, row["length"], every(known.name)):
         times.append(row[f"{video}/from_timestamp"] + t / round(known.hz))
-    frames = decode_video_frames(
-        video_path=folder / video / chunk / file,
-        timestamps=times,
-        tolerance_s=0.1 / known.hz,
-        backend="pyav",
-        return_uint8=True,
-    )
+    with bounded(folder):
+        frames = decode_video_frames(
+            video_path=folder / video / chunk / file,
+            timestamps=times,
+            tolerance_s=0.1 / known.hz,
+            backend="pyav",
+            return_uint8=True,
+        )
     return frames.permute(0, 2, 3, 1).numpy()
 
 

@@ -6,18 +6,21 @@ Datasets come from outside: they are parsed, never executed, and nothing is look
 import hashlib
 import io
 import logging
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import numpy as np
 
-from vap_core.base.errors import BadDataset
-from vap_core.base.files import sha256_of
+from vap_core.base.errors import BadDataset, BadPhoto
+from vap_core.base.files import read_file, sha256_of
+from vap_core.base.media import opened_picture, opened_video
 from vap_core.base.types import Mask, Rgb, Views, value
 
 if TYPE_CHECKING:
@@ -85,7 +88,10 @@ class Recorded:
         first, stop = int(about["dataset_from_index"]), int(about["dataset_to_index"])
         for number in range(stop - first):
             try:
-                item = self.dataset[first + number]
+                with bounded(self.folder):
+                    item = self.dataset[first + number]
+            except BadPhoto as error:
+                raise BadDataset(f"dataset: {self.folder}: {error}") from error
             except Exception as error:  # decoders of damaged files raise anything
                 raise _damaged(self.folder, error) from error
             views = {camera: _rgb(item[key]) for camera, key in self.keys.items()}
@@ -229,6 +235,40 @@ def offline() -> Iterator[None]:
             yield
     finally:
         logging.disable(level)
+
+
+@contextmanager
+def bounded(folder: Path) -> Iterator[None]:
+    """Inside, lerobot opens videos and pictures of the dataset in a folder as `base.media` does.
+
+    Their formats and their pixels are limited, and they lie in the folder.
+    """
+    import av
+    from datasets import Image
+    from lerobot.datasets import video_utils
+
+    decode = Image.decode_example
+
+    def inside(path: Path) -> Path:
+        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
+            raise BadPhoto(f"{path} lies outside of the dataset; copy it there.")
+        return path
+
+    def checked(self: Image, value: dict[str, Any], token_per_repo_id: Any = None) -> Any:
+        data = value["bytes"]
+        if data is None:
+            data = read_file(inside(folder / value["path"]))
+        with opened_picture(io.BytesIO(data), "a picture"):
+            return decode(self, {"bytes": data, "path": None})
+
+    def opened(path: str, *args: Any, **options: Any) -> Any:
+        if args or options:  # to write
+            return av.open(path, *args, **options)
+        return opened_video(inside(Path(path)))
+
+    limited = SimpleNamespace(**{**vars(av), "open": opened})
+    with patch.object(video_utils, "av", limited), patch.object(Image, "decode_example", checked):
+        yield
 
 
 def _cameras(dataset: "LeRobotDataset", folder: Path) -> dict[str, str]:
