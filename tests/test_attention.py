@@ -252,11 +252,21 @@ def test_layers_are_known_of_a_pi0_alone(tmp_path: Path) -> None:
 
 def test_pictures_that_are_padded_are_not_read(toys: dict[str, LeRobot]) -> None:
     """Of a picture that is padded to a square, some patches show no picture."""
-    pi0 = toys["pi0"].policy
-    feature = pi0.config.image_features["observation.images.front"]
-    assert hooks.can_watch(pi0)
-    with patch.object(feature, "shape", (3, 48, 64)):
-        assert not hooks.can_watch(pi0)
+    pi0, smolvla = toys["pi0"].policy, toys["smolvla"].policy
+    square, wide = torch.zeros(1, 3, 64, 64), torch.zeros(1, 3, 48, 64)
+    for policy in (pi0, smolvla):
+        assert hooks.can_watch(policy, [square])
+        feature = policy.config.image_features["observation.images.front"]
+        with patch.object(feature, "shape", (3, 48, 64)):  # declared, not given
+            assert hooks.can_watch(policy, [square])
+        assert not hooks.can_watch(policy, [wide])
+        assert not hooks.can_watch(policy, [square, wide])
+    with patch.object(smolvla.config, "resize_imgs_with_padding", None):
+        assert hooks.can_watch(smolvla, [square])
+        assert not hooks.can_watch(smolvla, [square, square[..., :32, :32]])
+        assert hooks.layout(smolvla, ["front"], 128).side == 4
+    with patch.object(smolvla.config, "resize_imgs_with_padding", (64, 32)):
+        assert not hooks.can_watch(smolvla, [square])
 
 
 def test_only_the_queries_asked_for_are_kept() -> None:

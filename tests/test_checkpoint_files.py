@@ -191,11 +191,58 @@ def test_no_door_lets_a_checkpoint_name_code(
     assert not (tmp_path / "attached").exists()
 
 
+def negative(key: str, tensor: torch.Tensor) -> tuple[str, torch.Tensor]:
+    return key, -tensor if key.endswith("std") else tensor
+
+
+def endless(key: str, tensor: torch.Tensor) -> tuple[str, torch.Tensor]:
+    return key, tensor * float("nan") if tensor.is_floating_point() else tensor
+
+
+@pytest.mark.parametrize(
+    ("file", "changed", "words"),
+    [
+        ("model.safetensors", endless, "has numbers that are not finite; copy it again"),
+        (BEFORE, endless, "has statistics of observation.* is no number, or negative"),
+        (AFTER, endless, "has statistics of action whose .* is no number, or negative"),
+        (AFTER, negative, "has statistics of action whose std is no number, or negative"),
+    ],
+)
+def test_numbers_that_are_none_are_refused(
+    copy: Path, file: str, changed: Callable[..., tuple[str, torch.Tensor]], words: str
+) -> None:
+    """They loaded, and every action was NaN."""
+    change(copy / file, changed)
+    with pytest.raises(BadPolicy, match=words):
+        load_policy(copy)
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_no_door_reads_beyond_the_folder(copy: Path, tmp_path: Path, door: str) -> None:
+    """`train --start` filled the memory with a configuration that was a device."""
+    mug = personal("mug", "cup", (40, 120, 110))
+    save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
+    whole = (copy / PIPELINES[0]).read_text()
+    (copy / PIPELINES[0]).write_text(whole.replace(BEFORE, f"../act/{BEFORE}"))
+    with pytest.raises(BadPolicy, match=f"reads '../act/{BEFORE}', outside of its folder"):
+        DOORS[door](copy, tmp_path)
+    (copy / "config.json").unlink()
+    (copy / "config.json").symlink_to("/dev/zero")
+    with pytest.raises(BadPolicy, match="lacks config.json"):
+        DOORS[door](copy, tmp_path)
+
+
 def test_what_is_no_file_of_a_checkpoint_is_not_attached(copy: Path, tmp_path: Path) -> None:
     mug = personal("mug", "cup", (40, 120, 110))
     save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
     for name in ("modeling.py", "state.pkl", "weights.bin"):
         (copy / name).write_bytes(b"x")
+    (copy / "tokenizer").mkdir()
+    (copy / "tokenizer" / "evil.py").touch()
+    (copy / "tokenizer" / "tokenizer.json").write_text("{}")
     attach(copy, tmp_path / "attached", tmp_path / "memory")
+    assert [path.name for path in (tmp_path / "attached" / "tokenizer").iterdir()] == [
+        "tokenizer.json"
+    ]
     kept = {path.name for path in copy.iterdir()} - {"modeling.py", "state.pkl", "weights.bin"}
     assert {path.name for path in (tmp_path / "attached").iterdir()} == kept

@@ -75,14 +75,21 @@ def lerobots(policy: LeRobot, name: str, task: str, side: int) -> list[dict[str,
     return heard.given
 
 
-@pytest.mark.parametrize(("kind", "side"), [*((kind, 224) for kind in MAKERS), ("act", 96)])
-def test_the_preprocessor_gets_the_same(tmp_path: Path, kind: str, side: int) -> None:
+WIDE = (480, 640)
+GIVEN = [*((kind, 224, WIDE) for kind in MAKERS), ("act", 96, WIDE), ("act", 224, (640, 480)),
+         ("smolvla", 224, (640, 480)), ("pi0", 224, (720, 1280)), ("act", 224, (512, 512))]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "side", "declared"), GIVEN)
+def test_the_preprocessor_gets_the_same(
+    tmp_path: Path, kind: str, side: int, declared: tuple[int, int]
+) -> None:
     """It got stretched frames of the size that a checkpoint declares, and no undeclared state."""
     folder = MAKERS[kind](tmp_path / "policy")
     config = json.loads((folder / "config.json").read_text())
     for feature in config["input_features"].values():
         if feature["type"] == "VISUAL":
-            feature["shape"] = [3, 480, 640]
+            feature["shape"] = [3, *declared]
     (folder / "config.json").write_text(json.dumps(config))
     with toy_sizes(tiny.TOY):
         asked = ("simpler-bridge", "put-camera", side)
@@ -100,11 +107,12 @@ def test_the_preprocessor_gets_the_same(tmp_path: Path, kind: str, side: int) ->
             assert value.dtype == given[key].dtype
 
 
-def test_every_camera_and_the_state_are_handed_over(tmp_path: Path) -> None:
-    """The tiny policy declares one of the three cameras of vlabench."""
+@pytest.mark.parametrize("read", [slice(1), slice(None, None, -1), slice(1, None)])
+def test_every_camera_and_the_state_are_handed_over(tmp_path: Path, read: slice) -> None:
+    """The tiny policy declares one of the three cameras of vlabench, all in another order, two."""
     suite, task = "vlabench", "select-cup"
     cameras = suites.suite(suite).cameras
-    folder = tiny.act_of(tmp_path / "policy", cameras[:1], 64, 14, 8)
+    folder = tiny.act_of(tmp_path / "policy", cameras[read], 64, 14, 8)
     here = ours(load_policy(folder), suite, task, 224)
     there = lerobots(load_policy(folder), suite, task, 224)
     assert {f"observation.images.{camera}" for camera in cameras} < here[0].keys()

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vap_core.base.errors import BadPolicy, first_line
-from vap_core.policies.lerobot.checkpoints import refuse_code
+from vap_core.policies.lerobot.checkpoints import locate, refuse_code
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.policies.names import SHIPPED
@@ -57,7 +57,7 @@ def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
 
     torch.manual_seed(seed)
     try:
-        refuse_code(folder)
+        refuse_code(locate(folder))
         config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
         learner = Learner(config)
         learner.policy.load_state_dict(load_file(folder / "model.safetensors"))

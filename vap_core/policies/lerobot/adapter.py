@@ -121,8 +121,8 @@ class LeRobot:
         """Shape of every feature that is read, under the key that the preprocessor expects."""
         self.learned: dict[int, torch.Tensor] = {}
         """The learned embedding of a word, by its token."""
-        self.attends = self.batched and can_watch(policy)
-        """Whether it reports its attention (attention_hooks)."""
+        self.attends = self.batched and can_watch(policy, ())
+        """Whether it reports its attention to square pictures."""
         self.predict = ChunkPredictor(policy, label)
 
     def with_tokens(self, words: Mapping[str, Float32[np.ndarray, " d"]]) -> "LeRobot":
@@ -242,13 +242,16 @@ class LeRobot:
 
     def _watching(self, batch: dict[str, Any]) -> AbstractContextManager[None]:
         """Reports the attention of a call where somebody observes it."""
-        if not self.attends or not attention_observed():
+        config: Any = self.policy.config
+        pictures = [batch[key] for key in config.image_features if key in batch]
+        if not (self.attends and attention_observed() and can_watch(self.policy, pictures)):
             return nullcontext()
         places = [
             positions(self.preprocessor, tokens, phrases_of(episode))
             for episode, tokens in enumerate(batch[TOKENS])
         ]
-        return reporting_attention(self.policy, self.cameras(), places)
+        side_px = pictures[0].shape[-1]
+        return reporting_attention(self.policy, self.cameras(), side_px, places)
 
     def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
         """What lerobot's loop would hand to the preprocessor, equal to the bit.

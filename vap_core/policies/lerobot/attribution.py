@@ -55,7 +55,8 @@ def gradient_maps(
             (0.5 * planned.square().sum()).backward()
     finally:
         hook.remove()
-    side = layout(policy.policy, policy.cameras()).side
+    camera, *_ = policy.cameras()
+    side = layout(policy.policy, [camera], policy_input.images[camera].shape[1]).side
     maps = {}
     for camera, activation in zip(policy.cameras(), activations, strict=False):
         assert activation.grad is not None
@@ -79,7 +80,8 @@ def masking_maps(policy: LeRobot, state: LeRobotState, policy_input: PolicyInput
 
     Raises: BadPolicy when the inputs do not fit.
     """
-    side = layout(policy.policy, policy.cameras()).side
+    camera, *_ = policy.cameras()
+    side = layout(policy.policy, [camera], policy_input.images[camera].shape[1]).side
     plain = _planned(policy, state, [policy_input])
     maps = {}
     for camera in policy.cameras():

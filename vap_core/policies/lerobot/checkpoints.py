@@ -102,7 +102,7 @@ def fingerprint(checkpoint: str | Path) -> str:
     """
     folder = locate(checkpoint)
     digest = hashlib.sha256()
-    for name in _deciding_files(folder):
+    for name in deciding_files(folder):
         digest.update(name.as_posix().encode())
         with (folder / name).open("rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
@@ -116,7 +116,7 @@ def stamp(checkpoint: str | Path) -> tuple[object, ...]:
     """
     folder = locate(checkpoint)
     found: list[object] = [folder.resolve()]
-    for name in _deciding_files(folder):
+    for name in deciding_files(folder):
         about = (folder / name).stat()
         found.append((name, about.st_ino, about.st_size, about.st_mtime_ns))
     return tuple(found)
@@ -149,6 +149,11 @@ def refuse_code(folder: Path) -> None:
                     "checkpoint, and the method by --method."
                 )
             ours = ours and module.startswith("lerobot.processor")
+            state = str(step.get("state_file") or "")
+            if Path(state).name != state:
+                raise BadPolicy(
+                    f"load: {folder / file} reads {state!r}, outside of its folder; copy it there."
+                )
             if step.get("registry_name") is None and not ours:
                 raise BadPolicy(
                     f"load: {folder / file} asks to run {name!r}, which is no step of lerobot; "
@@ -171,7 +176,7 @@ def _downloaded(name: str) -> Path:
     return Path(folder)
 
 
-def _deciding_files(folder: Path) -> list[Path]:
+def deciding_files(folder: Path) -> list[Path]:
     """The files of a checkpoint that decide what it does, by their names in its folder."""
     found = []
     for file in sorted(folder.rglob("*")):

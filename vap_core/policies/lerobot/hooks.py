@@ -112,8 +112,11 @@ class Layout:
     chunk: int
 
 
-def can_watch(policy: Any) -> bool:
-    """Whether the attention can be read: a pi0 or SmolVLA whose pictures are not padded."""
+def can_watch(policy: Any, pictures: Sequence[torch.Tensor]) -> bool:
+    """Whether the attention can be read: a pi0 or SmolVLA that does not pad these pictures.
+
+    It pads those that are given, whatever sizes it declares.
+    """
     model = getattr(policy, "model", None)
     if hasattr(model, "paligemma_with_expert"):
         target = policy.config.image_resolution
@@ -121,26 +124,28 @@ def can_watch(policy: Any) -> bool:
         target = policy.config.resize_imgs_with_padding
     else:
         return False
-    shapes = [feature.shape[-2:] for feature in policy.config.image_features.values()]
-    shapes += [] if target is None else [target]
-    return all(height == width for height, width in shapes)
+    shapes = [tuple(picture.shape[-2:]) for picture in pictures]
+    if target is None:  # as they are
+        return all(height == width == shapes[0][0] for height, width in shapes)
+    return target[0] == target[1] and all(height == width for height, width in shapes)
 
 
 @contextmanager
 def reporting_attention(
-    policy: Any, cameras: Sequence[str], positions: Sequence[Positions]
+    policy: Any, cameras: Sequence[str], side_px: int, positions: Sequence[Positions]
 ) -> Iterator[None]:
     """Inside, a policy that `can_watch` reports its attention to the image patches of its cameras.
 
-    `positions` are those of the queries that are words, by episode.
+    `side_px` is that of the pictures which it is given, `positions` are those of the queries that
+    are words, by episode.
     """
-    watch = Watch(layout(policy, cameras), positions)
+    watch = Watch(layout(policy, cameras, side_px), positions)
     with _watching_smolvla(policy, watch) if _is_smolvla(policy) else _watching_pi0(policy, watch):
         yield
     watch.report()
 
 
-def layout(policy: Any, cameras: Sequence[str]) -> Layout:
+def layout(policy: Any, cameras: Sequence[str], side_px: int) -> Layout:
     """Where a policy that `can_watch` holds the views of these cameras.
 
     The views come first, behind them empty cameras, then the text. SmolVLA sets marks around every
@@ -150,10 +155,8 @@ def layout(policy: Any, cameras: Sequence[str]) -> Layout:
     marks = 0
     if _is_smolvla(policy):
         vlm = policy.model.vlm_with_expert.config
-        pixels = config.resize_imgs_with_padding
-        if pixels is None:
-            pixels = next(iter(config.image_features.values())).shape[-2:]
-        side = pixels[0] // vlm.vision_config.patch_size // vlm.scale_factor
+        pixels, _ = config.resize_imgs_with_padding or (side_px, side_px)
+        side = pixels // vlm.vision_config.patch_size // vlm.scale_factor
         marks = MARKS if config.add_image_special_tokens else 0
     else:
         vision = policy.model.paligemma_with_expert.paligemma.config.vision_config

@@ -74,6 +74,8 @@ def _fault(step: Any, key: str, feature: Any) -> str:
             wide = tuple(torch.broadcast_shapes(found.shape, shape)) if len(shape) > 1 else None
         except RuntimeError:
             wide = None
+        if not torch.isfinite(found).all() or (name == "std" and (found < 0).any()):
+            return f"statistics of {key} whose {name} is no number, or negative"
         if shape not in (tuple(found.shape), wide):
             return f"statistics of {key} for {found.numel()} numbers, where it has {shape[0]}"
     return ""
@@ -138,6 +140,10 @@ def compare(policy: "PreTrainedPolicy", file: Path) -> None:
         }
         for key, name in names.items():
             found = stored.get_tensor(name) if key in weights else None
+            if found is not None and not torch.isfinite(found).all():
+                raise BadPolicy(
+                    f"load: {name} in {file} has numbers that are not finite; copy it again."
+                )
             if found is not None and torch.equal(found.to(weights[key].dtype), weights[key].cpu()):
                 tied.add(weights[key].data_ptr())
             else:

@@ -12,6 +12,7 @@ refuses the picture (`episodes="auto"`). The distribution lerobot_env_vap (plugi
 commands find all this.
 """
 
+import fnmatch
 import json
 import os
 import shutil
@@ -42,6 +43,7 @@ from vap_core.policies.lerobot.checkpoints import (
     STEP_CLASS,
     STEP_NAME,
     WANTED_FILES,
+    deciding_files,
     is_vap_step,
     locate,
     refuse_code,
@@ -305,10 +307,11 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
     try:
         out.mkdir(parents=True)
         made = True
-        for file in source.iterdir():
-            wanted = file.is_dir() or any(file.match(pattern) for pattern in WANTED_FILES)
-            if wanted and file.name != PIPELINES[0]:
-                os.symlink(file, out / file.name)
+        beside = [file.name for file in source.iterdir() if file.is_file()]
+        names = {name for pattern in WANTED_FILES for name in fnmatch.filter(beside, pattern)}
+        for name in {*map(Path, names), *deciding_files(source)} - {Path(PIPELINES[0])}:
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            os.symlink(source / name, out / name)
         (out / PIPELINES[0]).write_text(json.dumps(pipeline, indent=2))
     except OSError as error:
         if made:
