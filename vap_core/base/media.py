@@ -183,14 +183,6 @@ def _power(exponent: float) -> Callable[[Channels], Channels]:
     return lambda level: level**exponent
 
 
-def _pq(level: Channels) -> Channels:
-    """SMPTE ST 2084; white is 203 cd/m2 (ITU-R BT.2408)."""
-    root = level ** (1 / 78.84375)
-    return (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
-        1 / 0.1593017578125
-    ) * (10_000 / 203)
-
-
 def _hlg(level: Channels) -> Channels:
     """ARIB STD-B67 on a display of 1000 cd/m2, channel by channel; white is 203 cd/m2."""
     scene = np.where(
@@ -202,20 +194,14 @@ def _hlg(level: Channels) -> Channels:
 D65, D65_RED = (0.3127, 0.3290), (0.64, 0.33)
 PRIMARIES = {
     1: (*D65, *D65_RED, 0.30, 0.60, 0.15, 0.06),
-    5: (*D65, *D65_RED, 0.29, 0.60, 0.15, 0.06),
-    6: (*D65, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07),
-    7: (*D65, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07),
     9: (*D65, 0.708, 0.292, 0.170, 0.797, 0.131, 0.046),
-    11: (0.314, 0.351, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06),
     12: (*D65, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06),
 }
 """x and y of white, red, green and blue, by the number that ITU-T H.273 gives them; 1 is sRGB's."""
-TRANSFERS = {code: to_linear for code in (1, 6, 13, 14, 15)} | {
-    4: _power(2.2), 5: _power(2.8), 8: _power(1.0), 16: _pq, 18: _hlg,
-}  # fmt: skip
-"""The light of a level, both from 0 to 1, by H.273's number. Films of 1, 6, 14 and 15 are shown as
-sRGB."""
-UNSAID = (0, 2, 3)
+TRANSFERS = {1: to_linear, 4: _power(2.2), 5: _power(2.8), 8: _power(1.0), 18: _hlg}
+"""The light of a level, both from 0 to 1, by H.273's number."""
+AS_SRGB = (0, 2, 3, 5, 6, 7), (0, 2, 3, 6, 13, 14, 15)
+"""Primaries and transfers that are shown as sRGB: none is said, or those of television."""
 ADOBE_RGB = (*D65, *D65_RED, 0.21, 0.71, 0.15, 0.06)
 HEAD_BYTES = 65536
 """Of a picture's file, in which the codes of its colours stand."""
@@ -225,7 +211,8 @@ Space = tuple[tuple[float, ...], Callable[[Channels], Channels]]
 
 def _space_of(primaries: int, transfer: int, name: str) -> Space | None:
     """The colours of two codes of H.273; None for sRGB. Raises: BadPhoto for those not read."""
-    primaries, transfer = (1 if code in UNSAID else code for code in (primaries, transfer))
+    codes = zip((primaries, transfer), AS_SRGB, strict=True)
+    primaries, transfer = (1 if code in alike else code for code, alike in codes)
     if primaries not in PRIMARIES or transfer not in TRANSFERS:
         raise BadPhoto(
             f"{name} declares colours {primaries}/{transfer} of ITU-T H.273, which are not read "
@@ -264,16 +251,11 @@ def _declared_space(image: "Image.Image", head: bytes, name: str) -> Space | Non
 
 
 def _xyz(primaries: Sequence[float]) -> np.ndarray:
-    """The matrix from a space's linear RGB to CIE XYZ, adapted to sRGB's white (Bradford)."""
+    """The matrix from a space's linear RGB to CIE XYZ, in shares of its white."""
     x, y = np.reshape(primaries, (4, 2)).T
-    white, *_ = points = np.stack([x / y, np.ones(4), (1 - x - y) / y], axis=1)
-    columns = points[1:].T
-    matrix = columns * np.linalg.solve(columns, white)
-    cones = np.array(
-        [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
-    )
-    target = np.array([D65[0] / D65[1], 1, (1 - sum(D65)) / D65[1]])
-    return np.linalg.solve(cones, (cones @ target / (cones @ white))[:, None] * (cones @ matrix))
+    white, *points = np.stack([x / y, np.ones(4), (1 - x - y) / y], axis=1)
+    columns = np.transpose(points)
+    return columns * np.linalg.solve(columns, white) / white[:, None]
 
 
 def _space_to_srgb(rgb: Rgb, space: Space) -> Rgb:

@@ -165,43 +165,29 @@ def _plain(
     """
     surface = material.get("pbrMetallicRoughness", {})
     factor = shares(surface.get("baseColorFactor", [1.0] * 4), path, "a colour's factor")
-    glow = np.array(material.get("emissiveFactor", [0.0] * 3), np.float64)
-    glow = glow * material.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0)
-    rgba = _picture(path, sources, blob, surface.get("baseColorTexture"), find)
-    light = None
-    if glow.any():
-        shine = _picture(path, sources, blob, material.get("emissiveTexture"), find)
-        if shine is not None and rgba is not None:
-            shine = np.array(Image.fromarray(shine).resize(rgba.shape[1::-1]))
-        elif shine is not None:
-            rgba = np.full_like(shine, 255)
-        if rgba is None:
-            light = np.minimum(factor[:3] + glow, 1)
-        else:
-            table = to_linear(np.arange(256) / 255).astype(np.float32)
-            bright = 1 if shine is None else table[shine[..., :3]]
-            sum_ = table[rgba[..., :3]] * factor[:3].astype("f4") + bright * glow.astype("f4")
-            rgba = np.concatenate(
-                [np.round(255 * to_srgb(sum_)).astype(np.uint8), rgba[..., 3:]], axis=2
-            )
-            factor[:3] = 1
-    mode, alpha = material.get("alphaMode", "OPAQUE"), factor[3]
-    if rgba is None:
-        colour = to_srgb(factor[:3] if light is None else light)
-        if mode == "MASK":
-            alpha = float(alpha >= material.get("alphaCutoff", 0.5))
-        alpha = 1 if mode == "OPAQUE" else alpha
-        colour = alpha * colour + (1 - alpha) * BEHIND / 255
-        return {"pbrMetallicRoughness": {"baseColorFactor": [*colour.tolist(), 1.0]}}
-    levels = multiply(np.arange(256)[:, None], 255 * to_srgb(factor[:3])).astype(np.uint8)
-    rgb = np.stack([levels[rgba[..., i], i] for i in range(3)], axis=2)
-    if mode != "OPAQUE":
-        seen = rgba[..., 3] * alpha
-        if mode == "MASK":
-            seen = 255.0 * (seen >= 255 * material.get("alphaCutoff", 0.5))
-        opacity = np.round(seen).astype(np.uint8)
-        grey = Image.new("RGB", rgba.shape[1::-1], (BEHIND,) * 3)
-        rgb = np.array(Image.composite(Image.fromarray(rgb), grey, Image.fromarray(opacity)))
+    glow = np.array(material.get("emissiveFactor", [0.0] * 3), np.float32)
+    glow *= material.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0)
+    textures = surface.get("baseColorTexture"), material.get("emissiveTexture")
+    found = [_picture(path, sources, blob, each, find) for each in textures[: 1 + glow.any()]]
+    sizes = [each.shape[1::-1] for each in found if each is not None] or [(1, 1)]
+    pictures = [Image.new("RGBA", (1, 1), "white") if each is None else Image.fromarray(each)
+                for each in found]  # fmt: skip
+    rgba, *shining = (np.array(picture.resize(sizes[0])) for picture in pictures)
+    rgb, seen = rgba[..., :3], rgba[..., 3] / 255 * factor[3]
+    if shining or (factor[:3] != 1).any():
+        light = to_linear(np.arange(256) / 255).astype(np.float32)
+        total = light[rgb] * factor[:3].astype(np.float32)
+        total += sum(light[each[..., :3]] * glow for each in shining)
+        rgb = np.round(255 * to_srgb(total)).astype(np.uint8)
+    mode = material.get("alphaMode", "OPAQUE")
+    if mode == "MASK":
+        seen = 1.0 * (seen >= material.get("alphaCutoff", 0.5) - 1e-6)
+    if mode != "OPAQUE" and (seen < 1).any():
+        opacity = Image.fromarray(np.round(255 * seen).astype(np.uint8))
+        grey = Image.new("RGB", sizes[0], (BEHIND,) * 3)
+        rgb = np.array(Image.composite(Image.fromarray(rgb), grey, opacity))
+    if all(each is None for each in found):
+        return {"pbrMetallicRoughness": {"baseColorFactor": [*(rgb[0, 0] / 255).tolist(), 1.0]}}
     blob += bytes(-len(blob) % 4)
     bitmap = as_bitmap(rgb)
     view = {"buffer": 0, "byteOffset": len(blob), "byteLength": len(bitmap)}
@@ -260,16 +246,13 @@ def _place_texture(
     used = [texture for texture in textures if texture is not None]
     if not used:
         return
-    transform, *others = [texture.get("extensions", {}).get(TRANSFORM, {}) for texture in used]
-    number, *numbers = [
-        each.get("texCoord", texture.get("texCoord", 0))
-        for each, texture in zip([transform, *others], used, strict=True)
-    ]
+    transform = used[0].get("extensions", {}).get(TRANSFORM, {})
+    number = transform.get("texCoord", used[0].get("texCoord", 0))
     name = f"TEXCOORD_{number}"
     fault = ""
     if transform.get("rotation"):
         fault = f"turns a texture by {TRANSFORM}"
-    elif any(each != transform for each in others) or any(each != number for each in numbers):
+    elif {**used[0], "index": 0} != {**used[-1], "index": 0}:
         fault = "places its emissive texture otherwise than its base colour"
     if fault:
         raise BadObject(
