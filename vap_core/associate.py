@@ -6,21 +6,20 @@ once, the most probable one (MAP), by enumeration:
 
     sum_v references(v, i_v)  +  sum_{v < w} pair(v, i_v, w, i_w)
 
-Scores are natural logarithms. "None" (not visible in that view) scores 0, alone and in every pair;
-the other scores are relative to it.
+Scores are natural logarithms. Every view's likest candidate scores 0; "none" (not visible in that
+view) scores 0 in every pair.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vap_core.base.errors import BadStudy, BadViews
+from vap_core.base.errors import BadViews
 from vap_core.base.types import Association, Camera, Grounding, election_scores, value
-from vap_core.perception.candidates import Candidates
 
 Scores = Float64[np.ndarray, "_ _"]
 """One row per candidate of one view, one column per candidate of another."""
@@ -38,66 +37,23 @@ ROUNDED = 5e-3
 """How far a rotation that was rounded to three decimals may be from one."""
 HIGHEST_M = 20.0
 """A camera higher above the table than this has a pose in other units."""
-SLACK = 0.1
-"""Natural logarithms: a view's likest candidate whose pairs cost less is no worse than none."""
 HEIGHTS_M = (0.0, 0.08)
 """The centres of objects that stand on the table (z = 0 in the world) lie between these heights."""
 
-
-@dataclass(frozen=True)
-class Pairing:
-    """The evidence that two candidates of two views are one object.
-
-    The numbers are near the greatest conditional likelihood of the true choice, each term by
-    itself, in 114 rendered three-camera scenes of generic objects with two twins each (342 views,
-    every tenth box withheld; true boxes, embedded encoder). `evidence` and `absent` compare ratios
-    of cosine distances: they do not depend on an encoder's scale.
-
-    Raises: BadStudy for a number outside its range.
-    """
-
-    evidence: float = 3.7
-    """A candidate twice as far from the references, in cosine distance, is 2 ** `evidence` times
-    less likely."""
-    absent: float = 0.4
-    """The nearest candidate of a view is likelier than none if its distance to the references is
-    less than exp(`absent`) times the least distance in all views, and equally likely otherwise:
-    views differ in image quality, so only the other views can tell that it is another object."""
-    sigma_m: float = 0.03
-    spread_m: float = 0.08
-    """Distances between rays have deviation `sigma_m` for one object, and are as often below
-    `spread_m` as objects stand that close on a table."""
-    astray: float = 0.015
-    """The share of boxes so cut or so wrong that their centres carry no evidence."""
-    likest: float = 0.0
-    """A candidate's distance to the references is the geometric mean of that to the likest one, of
-    this weight, and of the mean distance; the numbers above were fitted with the mean alone."""
-    reliance: float = 0.0
-    """How much less the references tell its candidates apart in a view that is less like them: by
-    the least distance in all views over that in this one, to this power. (A wrist camera looks from
-    above, as few references do.) 0: every view counts the same."""
-    decisive: float = 0.0
-    """The best choice for all views is taken where its margin is at least this; elsewhere each view
-    keeps its own."""
-    hidden: float | None = None
-    """None of a view scores this share of its candidates' mean, less `SLACK`, and geometry only
-    speaks against pairs: an object that fewer views show has less of a disadvantage. The margin is
-    the lead over other objects, so over every choice that has no candidate of the best one. Views
-    are not compared: the likest candidate of each scores 0, so that single candidates which
-    contradict each other are undecided, and `decisive` leaves them as they are. By default `absent`
-    compares the views, pairs that match gain, and the margin is the lead over any choice."""
-
-    def __post_init__(self) -> None:
-        for name in ("sigma_m", "spread_m"):
-            if not getattr(self, name) > 0:
-                raise BadStudy(f"Pairing: {name} is {getattr(self, name)}; give more than 0.")
-        for name in ("astray", "likest"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise BadStudy(f"Pairing: {name} is {getattr(self, name)}; give a share, 0 to 1.")
-        for name in ("evidence", "reliance", "decisive", "hidden"):
-            number = getattr(self, name)
-            if number is not None and not 0 <= number < np.inf:
-                raise BadStudy(f"Pairing: {name} is {number}; give 0 or more.")
+EVIDENCE = 6.0
+"""A candidate twice as far from the references, in cosine distance, is 2 ** `EVIDENCE` times less
+likely. Ratios of distances do not depend on an encoder's scale."""
+RELIANCE = 3.0
+"""How much less the references tell its candidates apart in a view that is less like them: by the
+least distance in all views over that in this one, to this power. (A wrist camera looks from above,
+as few references do.)"""
+HIDDEN, SLACK = 0.5, 0.1
+"""None of a view scores this share of its candidates' mean, less `SLACK`."""
+SIGMA_M, SPREAD_M = 0.03, 0.08
+"""Distances between rays have deviation `SIGMA_M` for one object, and are as often below `SPREAD_M`
+as objects stand that close on a table."""
+ASTRAY = 0.015
+"""The share of boxes so cut or so wrong that their centres carry no evidence."""
 
 
 @value
@@ -113,14 +69,11 @@ class Sighting:
 
 
 def associate_targets(
-    groundings: Mapping[str, tuple[Grounding, ...]],
-    candidates: Mapping[str, Sequence[Candidates]],
-    cameras: Mapping[str, Camera],
-    pairing: Pairing,
+    groundings: Mapping[str, tuple[Grounding, ...]], cameras: Mapping[str, Camera]
 ) -> tuple[dict[str, tuple[Grounding, ...]], tuple[Association | None, ...]]:
     """Let the views agree on each target, one target at a time.
 
-    `groundings[camera][j]` and `candidates[camera][j]` are of target j.
+    `groundings[camera][j]` is of target j.
 
     Raises: as `associate`; BadViews, when a view has no camera although geometry needs one, or one
         that is calibrated for another image size or cannot see the table.
@@ -133,13 +86,13 @@ def associate_targets(
         sightings = {}
         for camera, per_target in groundings.items():
             _check_calibration(camera, per_target[j], cameras)
-            of_view = candidates[camera][j]
+            boxes = per_target[j].candidates
             sightings[camera] = Sighting(
-                cosine=election_scores(per_target[j].similarity, of_view.boxes),
-                xyxy=of_view.boxes.xyxy,
+                cosine=election_scores(per_target[j].similarity, boxes),
+                xyxy=boxes.xyxy,
                 camera=cameras.get(camera),
             )
-        association = associate(sightings, pairing)
+        association = associate(sightings)
         associations.append(association)
         for camera, per_target in groundings.items():
             grounding = per_target[j]
@@ -149,26 +102,23 @@ def associate_targets(
     return chosen, tuple(associations)
 
 
-def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | None:
-    """The most probable choice for `views`, by camera.
+def associate(views: Mapping[str, Sighting]) -> Association | None:
+    """The most probable choice for `views`, by camera; None where fewer than two have candidates.
 
-    None where fewer than two have candidates, or the choice is not decisive. As long as `absent` is
-    positive, the target is chosen in at least one view. Equal choices go to the candidates listed
-    first.
+    Equal choices go to the candidates listed first.
 
     Raises: BadViews, for more views or candidates than can be enumerated, or for geometry without
         calibrated cameras.
     """
     sightings = list(views.values())
-    n_seen = sum(len(view.xyxy) > 0 for view in sightings)
-    if n_seen < 2:
+    if sum(len(view.xyxy) > 0 for view in sightings) < 2:
         return None
     _check_size(sightings)
 
-    singles = references(sightings, pairing)
+    singles = references(sightings)
     pairs = {}
     for v, w in combinations(range(len(sightings)), 2):
-        scores = geometry(sightings[v], sightings[w], pairing)
+        scores = geometry(sightings[v], sightings[w])
         pairs[v, w] = np.pad(scores, ((0, 1), (0, 1)))
     totals = total_scores(singles, pairs)
     place = np.unravel_index(totals.argmax(), totals.shape)
@@ -182,30 +132,16 @@ def associate(views: Mapping[str, Sighting], pairing: Pairing) -> Association | 
         of_view = np.moveaxis(totals, v, 0).reshape(totals.shape[v], -1)
         support[name] = of_view.max(axis=1)
     total = float(totals[best])
-    if pairing.hidden is None:
-        rival = _best_other(list(support.values()), best)
-    else:
-        rival = _best_other_object(totals, best)
-    if total - rival < pairing.decisive:
-        return None
     return Association(
         chosen=chosen,
         total=total,
-        margin=total - rival,
+        margin=total - _best_other_object(totals, best),
         terms={
             "references": sum(float(single[i]) for single, i in zip(singles, best, strict=True)),
             "geometry": sum(float(s[best[v], best[w]]) for (v, w), s in pairs.items()),
         },
         support=support,
     )
-
-
-def _best_other(support: Sequence[ViewScores], best: Sequence[int]) -> float:
-    """The best total of a combination that differs from the `best` one in any view."""
-    rival = -np.inf
-    for scores, choice in zip(support, best, strict=True):
-        rival = max(rival, float(np.delete(scores, choice).max(initial=-np.inf)))
-    return rival
 
 
 def _best_other_object(totals: Float64[np.ndarray, "..."], best: Sequence[int]) -> float:
@@ -233,56 +169,45 @@ def total_scores(singles: Sequence[ViewScores], pairs: PairScores) -> Float64[np
     return totals
 
 
-def references(views: Sequence[Sighting], pairing: Pairing) -> list[ViewScores]:
+def references(views: Sequence[Sighting]) -> list[ViewScores]:
     """The references' evidence for the candidates of every view, and the score of none.
 
-    It is `evidence` ((d / d_v) ** `reliance` log(d_v / d_i) + max(log(d / d_v) + `absent`, 0)), and
-    0 for none. d_i is 1 - the mean cosine of candidate i with the references (by `likest` the
-    greatest), d_v the least in its view, d the least in all views. Where `hidden` is given, the
-    second part is left out, and none scores as it says.
+    It is `EVIDENCE` (d / d_v) ** `RELIANCE` log(d_v / d_i): d_i is candidate i's distance, the
+    geometric mean of 1 - its mean cosine and 1 - its greatest; d_v is the least in its view, d the
+    least in all views.
     """
     distances = []
     for view in views:
         cosine = view.cosine.astype(np.float64)
         to_all = np.maximum(1.0 - cosine.mean(axis=1), NEAREST)
         to_likest = np.maximum(1.0 - cosine.max(axis=1), NEAREST)
-        distances.append(to_all ** (1 - pairing.likest) * to_likest**pairing.likest)
+        distances.append(np.sqrt(to_all * to_likest))
     least = min(float(d.min()) for d in distances if len(d))
     scores = []
     for d in distances:
         nearest = d.min(initial=np.inf)
-        trust = (least / nearest) ** pairing.reliance
-        visible = 0.0
-        if len(d) and pairing.hidden is None:
-            lead = float(np.log(least / nearest))
-            visible = max(lead + pairing.absent, 0.0)
-        of_view = pairing.evidence * (trust * np.log(nearest / d) + visible)
-        none = 0.0
-        if len(d) and pairing.hidden is not None:
-            none = pairing.hidden * float(of_view.mean()) - SLACK
+        of_view = EVIDENCE * (least / nearest) ** RELIANCE * np.log(nearest / d)
+        none = HIDDEN * float(of_view.mean()) - SLACK if len(d) else 0.0
         scores.append(np.append(of_view, none))
     return scores
 
 
-def geometry(a: Sighting, b: Sighting, pairing: Pairing) -> Scores:
-    """Log ratio of two densities of `ray_distance_m`.
+def geometry(a: Sighting, b: Sighting) -> Scores:
+    """Log ratio of two densities of `ray_distance_m`, less its greatest value.
 
-    For one object a Gaussian of `sigma_m`, but for a share `astray`; for two, `spread_m` wide. With
-    `hidden` less its greatest value.
+    For one object a Gaussian of `SIGMA_M`, but for a share `ASTRAY`; for two, `SPREAD_M` wide.
+    Geometry only speaks against pairs: an object that fewer views show has no disadvantage.
 
     Raises: BadViews, without calibrated cameras.
     """
     if a.camera is None or b.camera is None:
         raise BadViews(
             "associate: needs calibrated cameras; give Attender.start cameras=..., or ground every "
-            "view by itself (Prompting.associate=None)."
+            "view by itself (Prompting.associate=False)."
         )
-    gaussian = np.exp(-0.5 * (ray_distance_m(a, b) / pairing.sigma_m) ** 2)
-    densest = (pairing.spread_m / pairing.sigma_m) ** 2
-    scores = np.log(pairing.astray + (1 - pairing.astray) * densest * gaussian)
-    if pairing.hidden is not None:
-        scores -= np.log(pairing.astray + (1 - pairing.astray) * densest)
-    return scores
+    gaussian = np.exp(-0.5 * (ray_distance_m(a, b) / SIGMA_M) ** 2)
+    densest = (1 - ASTRAY) * (SPREAD_M / SIGMA_M) ** 2
+    return np.log((ASTRAY + densest * gaussian) / (ASTRAY + densest))
 
 
 def ray_distance_m(a: Sighting, b: Sighting) -> Scores:
@@ -304,15 +229,6 @@ def ray_distance_m(a: Sighting, b: Sighting) -> Scores:
     height = np.clip(best, *HEIGHTS_M)
     distance = np.linalg.norm(foot + height[..., None] * slope, axis=-1)
     return np.where(np.isfinite(distance), distance, np.inf)
-
-
-PAIRINGS: dict[str, Pairing] = {
-    "geometry": Pairing(),
-    "objects": Pairing(evidence=6.0, reliance=3.0, likest=0.5, hidden=0.5, decisive=1.25),
-}
-"""`objects` was chosen on first frames of development layouts with 40 generic objects a task that
-nothing was trained on, and their twins (vlabench 400, tabletop 640): 18 and 23 common errors, 95
-and 99 contradictions; every view for itself 12 and 14, 199 and 272."""
 
 
 def overrule(grounding: Grounding, choice: int | None) -> Grounding:
@@ -368,7 +284,7 @@ def _check_poses(
         raise BadViews(
             f"associate: needs calibrated cameras; give Attender.start cameras=... for "
             f"{', '.join(missing)} (given: {', '.join(cameras) or 'none'}), or ground every view "
-            "by itself (Prompting.associate=None)."
+            "by itself (Prompting.associate=False)."
         )
     faults = {view: _pose_fault(cameras[view]) for view in views}
     if not any(faults.values()) and all(_looks_away(cameras[view]) for view in views):
@@ -412,7 +328,7 @@ def _check_size(sightings: Sequence[Sighting]) -> None:
         raise BadViews(
             f"associate: {len(sightings)} views with {size} combinations; at most {MOST_VIEWS} "
             f"views and {MOST_COMBINATIONS} combinations are enumerated. Give fewer cameras or "
-            "candidates, or ground views one by one (Prompting.associate=None)."
+            "candidates, or ground views one by one (Prompting.associate=False)."
         )
 
 

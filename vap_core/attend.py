@@ -20,10 +20,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from unicodedata import normalize
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from vap_core.associate import Pairing, associate_targets
+from vap_core.associate import associate_targets
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews
 from vap_core.base.events import Visible, grounding_events, visibility_events
 from vap_core.base.types import (
@@ -58,6 +59,11 @@ from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours, has_colour
 from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
+GROUNDING_PX = 448
+"""The longer side of the views in which objects are looked for, where a camera can give more pixels
+than the policy sees."""
+LEAST_COVER = 0.4
+"""Share of a pixel that a mask of a larger view covers, from which on it is of the mask."""
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
 
@@ -66,13 +72,13 @@ PerTarget = tuple[Grounding, ...]
 class Prompting:
     """What is changed in the policy's inputs: by default the paper's method.
 
-    The switches are ablations. `associate` goes beyond the paper: views agree on one candidate each
-    (associate.PAIRINGS by name); None grounds them one by one. `always_tint` is the paper's rule:
+    The switches are ablations. `associate` goes beyond the paper: calibrated views agree on one
+    object; by default each is grounded by itself. `always_tint` is the paper's rule:
     the best candidate wins, however unlike the references it is. Without it an object whose best
     candidate is below the stack's threshold is not in view. `references` is how many of an object's
     references are used, the first ones; None uses all.
 
-    Raises: UnknownName, BadStudy, when it is built from what is no rule, pairing or count, or from
+    Raises: UnknownName, BadStudy, when it is built from what is no rule or count, or from
         a palette with a name twice or a colour without a hue.
     """
 
@@ -81,18 +87,13 @@ class Prompting:
     highlight: bool = True
     rewrite: bool = True
     rule: VoteRule = "vote"
-    associate: Pairing | None = None
+    associate: bool = False
     always_tint: bool = False
     references: int | None = None
 
     def __post_init__(self) -> None:
         check_rule(self.rule, "Prompting")
         _check_palette(self.palette)
-        if not isinstance(self.associate, Pairing | None):
-            raise BadStudy(
-                f"Prompting: associate is {self.associate!r}; give a Pairing, for example "
-                'PAIRINGS["geometry"], or None.'
-            )
         if self.references is not None and self.references < 1:
             raise BadStudy(
                 f"Prompting: references is {self.references}; give 1 or more, or None for all."
@@ -173,6 +174,42 @@ def _clip_to_views(boxes: Mapping[str, Boxes], views: Views) -> dict[str, Boxes]
     return clipped
 
 
+def _check_larger(views: Views, looked_at: Views) -> None:
+    """Raises: BadViews: a larger view is no RGB picture, of no camera, or of another shape."""
+    check_views(looked_at)
+    for camera, rgb in looked_at.items():
+        if camera not in views:
+            raise BadViews(
+                f"Attender.start: a larger view of {camera!r}, but the views are of "
+                f"{', '.join(sorted(views))}; name it after one of them."
+            )
+        height, width = views[camera].shape[:2]
+        tall, wide = rgb.shape[:2]
+        if abs(wide * height - tall * width) > max(tall, wide):
+            raise BadViews(
+                f"Attender.start: the larger view of {camera!r} is {wide}x{tall}, but the view "
+                f"{width}x{height}; give the same picture with more pixels."
+            )
+
+
+def _scaled(boxes: Boxes, of: Rgb, to: Rgb) -> Boxes:
+    """The boxes of a picture in the pixels of another size of it."""
+    scale = np.array([to.shape[1] / of.shape[1], to.shape[0] / of.shape[0]] * 2, np.float32)
+    return replace(boxes, xyxy=boxes.xyxy * scale)
+
+
+def _carry(found: Candidates, of: Rgb, to: Rgb) -> Candidates:
+    """What was found in a view, in the pixels of another size of it."""
+    h, w = to.shape[:2]
+    if of.shape[:2] == (h, w):
+        return found
+    masks = np.zeros((len(found.masks), h, w), bool)
+    for mask, large in zip(masks, found.masks, strict=True):
+        cover = cv2.resize(large.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+        mask[:] = cover >= min(LEAST_COVER, max(float(cover.max()), 1e-6))
+    return replace(found, boxes=_scaled(found.boxes, of, to), masks=masks)
+
+
 class Attender:
     """Grounds personal objects at t = 0, tracks them afterwards, and prompts every image.
 
@@ -213,18 +250,21 @@ class Attender:
         objects: Sequence[str] | None = None,
         boxes: Mapping[str, Boxes] | None = None,
         cameras: Mapping[str, Camera] | None = None,
+        larger: Views | None = None,
     ) -> tuple[AttendState, Attended]:
         """Ground every target of `instruction` in every view (t = 0).
 
         `objects` names the remembered object of each "my cup" in turn, where its category alone
         does not decide. `boxes` replaces the detector by candidates given by hand, clipped to their
         view; a camera that it leaves out has none. `cameras` are the calibrated cameras at this
-        moment, which association by geometry needs.
+        moment, which association needs. `larger` are the same views with more pixels, in which
+        objects are looked for instead: what is found is carried to the pixels of `views`.
 
         Raises:
             BadInstruction, UnknownName: the instruction does not match the memory.
             BadViews: a view is no RGB picture, there are boxes of a camera that gives none or
-                outside its view, or the views cannot be associated.
+                outside its view, a larger view has another shape, or the views cannot be
+                associated.
             BadEncoder: an encoder gives rows that are not finite or not of length 1.
         """
         check_views(views)
@@ -232,29 +272,32 @@ class Attender:
             boxes = _clip_to_views(boxes, views)
         parsed, wanted = self.understand(instruction, objects)
         phrases = [target.category for target in parsed.targets]
-        proposals = self._propose(views, phrases, boxes)
+        looked_at = {**views, **(larger or {})}
+        _check_larger(views, looked_at)
+        if boxes is not None:
+            boxes = {
+                camera: _scaled(of_view, views[camera], looked_at[camera])
+                for camera, of_view in boxes.items()
+            }
+        proposals = self._propose(looked_at, phrases, boxes)
 
         candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, PerTarget] = {}
-        for camera, rgb in views.items():
+        for camera, rgb in looked_at.items():
             of_view: list[Candidates] = []
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
                 offered = proposals[camera][phrase]
                 few, cosine = nominate(rgb, obj, offered, self.stack)
                 of_view.append(segment(rgb, few, self.stack, known=of_view))
-                per_target.append(self.ground(camera, obj, of_view[-1], cosine))
-            candidates[camera] = tuple(of_view)
+                carried = _carry(of_view[-1], rgb, views[camera])
+                per_target.append(self.ground(camera, obj, carried, cosine))
+            candidates[camera] = tuple(_carry(part, rgb, views[camera]) for part in of_view)
             groundings[camera] = tuple(per_target)
 
         associations: tuple[Association | None, ...] = ()
-        if self.prompting.associate is not None:
-            groundings, associations = associate_targets(
-                groundings=groundings,
-                candidates=candidates,
-                cameras=cameras or {},
-                pairing=self.prompting.associate,
-            )
+        if self.prompting.associate:
+            groundings, associations = associate_targets(groundings, cameras or {})
         for camera, elected in groundings.items():
             groundings[camera] = tuple(map(self.reject, elected))
         return self.begin(parsed, views, candidates, groundings, associations)

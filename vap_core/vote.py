@@ -32,9 +32,9 @@ VoteRule = Literal["vote", "average", "best"]
 RULES: tuple[str, ...] = get_args(VoteRule)
 
 SAME_PLACE = 0.5
-"""Of two boxes of which the smaller is covered by more than this share, one is a candidate."""
+"""Of two boxes of which the smaller is covered by more than this share, one shows the place."""
 MOST_CANDIDATES = 4
-"""Candidates of one object among proposals of any object. Each of them is segmented and tracked."""
+"""Proposals that are kept as candidates, unless more have votes. Each is segmented."""
 
 
 def similarity(
@@ -87,20 +87,20 @@ def nominate(
 def shortlist(
     boxes: Boxes, cosine: Float32[np.ndarray, "n k"], most: int
 ) -> Int64[np.ndarray, " m"]:
-    """Which proposals are candidates, given their cosines with an object's references.
+    """Which proposals are candidates, in their order, given their cosines with the references.
 
-    Proposals of any object overlap: of those in one place the one of the best mean score is taken,
-    and at most `most` places. Proposals of one category are all candidates.
+    All that a reference votes for, so that a vote among the candidates is one among all proposals;
+    then, up to `most`, those of the best mean score in other places.
     """
-    if boxes.prior is None:
+    if len(boxes) <= most:
         return np.arange(len(boxes))
-    mean = election_scores(cosine, boxes).astype(np.float64).mean(axis=1)
+    scores = election_scores(cosine, boxes)
     cover = box_cover(boxes.xyxy, boxes.xyxy)
-    kept: list[int] = []
-    for i in np.argsort(-mean, kind="stable").tolist():
-        if len(kept) < most and cover[i, kept].max(initial=0.0) <= SAME_PLACE:
+    kept = np.unique(best_of_references(scores)).tolist()
+    for i in np.argsort(-scores.astype(np.float64).mean(axis=1), kind="stable").tolist():
+        if len(kept) < most and cover[i, kept].max() <= SAME_PLACE:
             kept.append(i)
-    return np.array(kept, np.int64)
+    return np.sort(np.array(kept, np.int64))
 
 
 def check_rule(rule: str, what: str) -> None:

@@ -279,8 +279,7 @@ class Association:
 
     Scores are natural logarithms. `chosen[camera]` is a candidate, or None: not visible there.
     `total` is the chosen combination's score, `terms` its parts by name, and `margin` its lead over
-    the best combination that differs in any view (by associate.Pairing.hidden the best one that
-    shares no candidate with it).
+    the best combination that shares no candidate with it.
     `support[camera]` holds the best total of any combination with each candidate of that view, and
     last with none."""
 

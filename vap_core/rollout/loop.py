@@ -246,8 +246,10 @@ def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observa
     if not observation.images or episode.homing is not None:
         return unchanged(observation.images, episode.goal.instruction)
     context = _context(trial, episode)
+    drawn_s = episode.env.seconds["render"]
     with _timed(episode.seconds, "attend"):
         state, attended = trial.prompter.start(_shown(observation), context)
+    episode.seconds["attend"] -= episode.env.seconds["render"] - drawn_s
     episode.prompter_state = state
     episode.prompting = True
     return attended
@@ -299,7 +301,7 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
         judge = episode.judge
         truth = SceneTruth(episode.goal, masks, step=judge.steps, moved=judge.moved)
     cameras = {camera.name: camera for camera in episode.env.cameras()}
-    return PromptContext(episode.goal.instruction, cameras, truth)
+    return PromptContext(episode.goal.instruction, cameras, truth, episode.env.look)
 
 
 def _open_sink(

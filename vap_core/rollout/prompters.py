@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from vap_core.associate import overrule
-from vap_core.attend import Attender, AttendState, Prompting
+from vap_core.attend import GROUNDING_PX, Attender, AttendState, Prompting
 from vap_core.base.errors import BadInstruction, BadMemory, BadStudy
 from vap_core.base.types import (
     Attended,
@@ -51,13 +51,15 @@ class SceneTruth:
 class PromptContext:
     """What a prompter knows besides the observation.
 
-    `cameras` are the calibrated cameras at this moment, by name. `truth` is there only for a
-    prompter that declares it.
+    `cameras` are the calibrated cameras at this moment, by name. `look` takes the views of this
+    moment again with a longer side of so many pixels; None where the cameras give no more. `truth`
+    is there only for a prompter that declares it.
     """
 
     instruction: str
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     truth: SceneTruth | None = None
+    look: Callable[[int], Views] | None = None
 
 
 @runtime_checkable
@@ -235,7 +237,14 @@ class TintPrompter:
     def start(
         self, observation: Observation, context: PromptContext
     ) -> tuple[AttendState, Attended]:
-        return self.attender.start(observation.images, context.instruction, cameras=context.cameras)
+        views = observation.images
+        longest = max(max(rgb.shape[:2]) for rgb in views.values())
+        larger = None
+        if context.look is not None and longest < GROUNDING_PX:
+            larger = context.look(GROUNDING_PX)
+        return self.attender.start(
+            views, context.instruction, cameras=context.cameras, larger=larger
+        )
 
     def steps(
         self,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
-from vap_core.base.types import Camera, Mask, value
+from vap_core.base.types import Camera, Mask, Views, value
 from vap_core.simulation import cameras as optics
 from vap_core.simulation.cameras import hand_geoms
 from vap_core.simulation.contacts import (
@@ -208,6 +208,15 @@ class Env:
         The latter is the tcp's position (m) and rotation vector from straight down (rad), the
         gripper's opening 0..1, and the joint angles (rad).
         """
+        return Observation(self._views(self.image_hw), self.state())
+
+    def look(self, longer_px: int) -> Views:
+        """The views of this moment once more, with `longer_px` pixels on their longer side."""
+        scale = longer_px / max(self.image_hw)
+        height, width = (max(1, round(side * scale)) for side in self.image_hw)
+        return self._views((height, width))
+
+    def _views(self, hw: tuple[int, int]) -> Views:
         with self._timed("render"):
             light = PLAIN_LIGHT
             if self._row is not None:
@@ -215,13 +224,13 @@ class Env:
             images = {}
             for name in self.camera_names:
                 rgb = self.scene.renderer.rgb(
-                    self._data, name, self.image_hw, light=light, **self._shown(name)
+                    self._data, name, hw, light=light, **self._shown(name)
                 )
                 if self._row is not None and name in self._disturbances:
                     errors = self._disturbances[name]
                     rgb = apply_sensor(self.sensor, rgb, errors, self._row, name, self._step())
                 images[name] = rgb
-        return Observation(images, self.state())
+        return images
 
     def state(self) -> Float32[np.ndarray, " s"]:
         """The proprioception alone, as in `observe`."""

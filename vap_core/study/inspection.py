@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vap_core.associate import PAIRINGS, Pairing, compare_views
+from vap_core.associate import compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import UnknownName
 from vap_core.base.types import Grounding, Mask, PersonalObject
@@ -22,7 +22,7 @@ from vap_core.simulation import suites
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.suites.open_row import build_scene
 from vap_core.simulation.types import EpisodeRow, Outcome
-from vap_core.study.perception import OFF, VISIBLE_PX, View, object_under_box
+from vap_core.study.perception import ASSOCIATED, OFF, VISIBLE_PX, View, object_under_box
 from vap_core.study.tracking import KEPT
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NAMED_IOU = 0.1
 """A candidate whose mask overlaps every object by less is none of them."""
 Ways = Mapping[str, Mapping[str, Grounding]]
-"""The first target's grounding in every view, by way to associate: OFF, or a name of PAIRINGS."""
+"""The first target's grounding in every view, by way to associate: OFF or ASSOCIATED."""
 
 
 def episode(suite: str, task: str, number: int) -> EpisodeRow:
@@ -77,21 +77,18 @@ def grounding_table(
 
 
 def associations(stack: Stack, mine: PersonalObject, views: Sequence[View]) -> Ways:
-    """The views grounded one by one, and once with each pairing.
+    """The views grounded one by one, and associated where the `optics` of all views are known.
 
-    The candidates are the same, the choices perhaps others. Pairings need the `optics` of all
-    views.
+    The candidates are the same, the choices perhaps others.
 
     Raises: as `Attender.start`.
     """
     images = {view.camera: view.rgb for view in views}
     optics = {view.camera: view.optics for view in views if view.optics is not None}
-    ways: dict[str, Pairing | None] = {OFF: None}
-    if len(optics) == len(views):
-        ways |= PAIRINGS
     found = {}
-    for name, way in ways.items():
-        attender = Attender(stack, {mine.name: mine}, Prompting(associate=way))
+    for name in (OFF, ASSOCIATED) if len(optics) == len(views) else (OFF,):
+        prompting = Prompting(associate=name == ASSOCIATED)
+        attender = Attender(stack, {mine.name: mine}, prompting)
         _, attended = attender.start(images, views[0].row.instruction, cameras=optics)
         found[name] = {camera: first for camera, (first, *_) in attended.groundings.items()}
     return found
@@ -213,14 +210,14 @@ def recovery(track: "pd.DataFrame", occlusion: Occlusion) -> "pd.DataFrame":
 def contradicted(agreements: "pd.DataFrame") -> EpisodeRow | None:
     """The first surveyed episode whose views highlight different objects until associated.
 
-    Grounded one by one they differ, and associated by geometry they do not. Where there is no such
+    Grounded one by one they differ, and associated they do not. Where there is no such
     episode, the first whose views contradict each other; None where there is none of these.
 
     Raises: UnknownName for an episode that the list of today does not have.
     """
     key = ["suite", "task", "episode"]
     alone = agreements[(agreements.associate == OFF) & (agreements.case == "case 2")]
-    right = (agreements.associate == "geometry") & (agreements.case == "right")
+    right = (agreements.associate == ASSOCIATED) & (agreements.case == "right")
     remedied = alone.merge(agreements.loc[right, key], on=key)
     chosen = remedied if len(remedied) else alone
     if chosen.empty:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vap_core.associate import PAIRINGS
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import source_digest
@@ -220,12 +219,10 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "association": Ablation(
         question="Should views agree on one candidate?",
-        arms={
-            "associated-objects": Prompting(associate=PAIRINGS["objects"]),
-        },
+        arms={},
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
-        retired=5,
+        retired=6,
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",
@@ -267,7 +264,7 @@ METHODS: dict[str, Method] = {
     "vap-always-tint": Prompting(always_tint=True),
     "mask-only": Prompting(rewrite=False),
     "rewrite-only": Prompting(highlight=False),
-    "vap-associated": Prompting(associate=PAIRINGS["geometry"]),
+    "vap-associated": Prompting(associate=True),
     "oracle-box": Oracle("box"),
     "oracle-mask": Oracle("mask"),
     "oracle-track": Oracle("track"),
@@ -288,7 +285,6 @@ PUBLISHED = frozenset(
     opacity-0.1 opacity-0.3 opacity-0.7 only-red only-blue only-green only-magenta only-cyan
     only-yellow only-orange only-purple hidden-1 hidden-2 hidden-3 hidden-4 hidden-5 hidden-6
     blank-text other-text mask-area-0.25 mask-area-0.5 mask-area-1.5 mask-area-2.0 mask-shifted
-    associated-objects
     switched-early switched-moved
 """.split()
 )

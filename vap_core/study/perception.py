@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from vap_core.associate import PAIRINGS, Pairing, Sighting, associate, compare_views
+from vap_core.associate import Sighting, associate, compare_views
 from vap_core.base.types import (
     Boxes,
     Camera,
@@ -349,8 +349,8 @@ def _stack_boxes(boxes: Sequence[Box]) -> Float32[np.ndarray, "n 4"]:
     return np.array(boxes, np.float32).reshape(-1, 4)
 
 
-OFF = "off"
-"""Views grounded one by one, as the paper does."""
+OFF, ASSOCIATED = "off", "associated"
+"""Views grounded one by one, as the paper does, and made to agree."""
 
 
 def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tables:
@@ -391,10 +391,9 @@ def agreements(
         cosine = election_scores(compare(personal, chosen, stack), chosen.boxes)
         few[view.camera] = chosen.boxes.xyxy
         sightings[view.camera] = Sighting(cosine, chosen.boxes.xyxy, camera=view.optics)
-    ways: Mapping[str, Pairing | None] = {OFF: None, **PAIRINGS}
     table = []
-    for name, pairing in ways.items():
-        found = None if pairing is None else associate(sightings, pairing)
+    for name in (OFF, ASSOCIATED):
+        found = associate(sightings) if name == ASSOCIATED else None
         highlighted: dict[str, str | None] = {}
         for view in episode:
             i = vote(sightings[view.camera].cosine).winner

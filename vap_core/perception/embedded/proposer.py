@@ -279,9 +279,9 @@ class OpenDetector:
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
     ) -> list[Boxes]:
-        """The proposals of each image with their priors; `threshold` bounds the proposer's score.
+        """The proposals of each image; `threshold` bounds the proposer's score.
 
-        A word that the phrase head does not know changes nothing but the priors.
+        Those of unfamiliar views have priors.
         """
         if threshold is None:
             threshold = LEAST_SCORE
@@ -293,11 +293,13 @@ class OpenDetector:
             xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
             alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=len(xyxy))
             xyxy, score = xyxy[alone], score[alone]
+            evidence = None
             if familiar:
                 kept = agreed(xyxy, named)
                 kept[:MOST_FAMILIAR] = True
                 xyxy, score = xyxy[kept], score[kept]
-            evidence = prior(xyxy, score, named)
+            else:
+                evidence = prior(xyxy, score, named)
             found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
         return found
 
