@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.toys import TOYS, personal, scene
-from vap_core.associate import PAIRINGS
 from vap_core.base.types import Boxes, PersonalObject, Rgb
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
@@ -17,6 +16,7 @@ from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.types import EpisodeRow, Placement
 from vap_core.study.perception import (
+    ASSOCIATED,
     OFF,
     RULES,
     Tables,
@@ -223,7 +223,7 @@ def test_agreements_tell_contradiction_and_what_geometry_makes_of_it() -> None:
         line["associate"]: line
         for line in agreements(episode, [embedded_boxes(v, target) for v in episode], mine, TOYS)
     }
-    assert list(honest) == [OFF, *PAIRINGS]
+    assert list(honest) == [OFF, ASSOCIATED]
     assert all(
         (line["case"], line["right"], line["views"]) == ("right", 3, 3) for line in honest.values()
     )

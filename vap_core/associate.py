@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vap_core.base.errors import BadViews
-from vap_core.base.types import Association, Camera, Grounding, election_scores, value
+from vap_core.base.types import SAME, Association, Camera, Grounding, election_scores, value
 
 Scores = Float64[np.ndarray, "_ _"]
 """One row per candidate of one view, one column per candidate of another."""
@@ -103,9 +103,9 @@ def associate_targets(
 
 
 def associate(views: Mapping[str, Sighting]) -> Association | None:
-    """The most probable choice for `views`, by camera; None where fewer than two have candidates.
+    """The most probable choice for `views`, by camera.
 
-    Equal choices go to the candidates listed first.
+    None where fewer than two have candidates, or two objects are equally probable.
 
     Raises: BadViews, for more views or candidates than can be enumerated, or for geometry without
         calibrated cameras.
@@ -132,10 +132,13 @@ def associate(views: Mapping[str, Sighting]) -> Association | None:
         of_view = np.moveaxis(totals, v, 0).reshape(totals.shape[v], -1)
         support[name] = of_view.max(axis=1)
     total = float(totals[best])
+    margin = total - _best_other_object(totals, best)
+    if margin <= SAME:
+        return None
     return Association(
         chosen=chosen,
         total=total,
-        margin=total - _best_other_object(totals, best),
+        margin=margin,
         terms={
             "references": sum(float(single[i]) for single, i in zip(singles, best, strict=True)),
             "geometry": sum(float(s[best[v], best[w]]) for (v, w), s in pairs.items()),
