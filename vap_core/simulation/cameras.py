@@ -237,6 +237,9 @@ class Renderer:
         if renderer is None:
             quality = self.model.vis.quality
             samples = quality.offsamples
+            buffer = self.model.vis.global_  # MuJoCo draws into 640 x 480 unless told
+            buffer.offheight = max(buffer.offheight, height)
+            buffer.offwidth = max(buffer.offwidth, width)
             max_geom = self.model.ngeom + 64
             try:
                 if masks:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from vap_core.associate import Sighting, associate, compare_views
+from vap_core.attend import GROUNDING_PX
 from vap_core.base.types import (
     Boxes,
     Camera,
@@ -93,7 +94,9 @@ class View:
         return {name: mask for name, mask in self.masks.items() if mask.sum() >= self.least_px}
 
 
-def opening_views(rows: Sequence[EpisodeRow], size: int = 224) -> Iterator[list[View]]:
+def opening_views(
+    rows: Sequence[EpisodeRow], size: int = GROUNDING_PX
+) -> Iterator[list[View]]:
     """The views of each row in turn, by the cameras, look, control and sensor of its suite.
 
     Rows of one suite and variant share a scene and come together. Pictures are `size` pixels wide
