@@ -46,7 +46,7 @@ from vap_core.base.types import (
 )
 from vap_core.instruction import Parser, rewrite, unite
 from vap_core.instruction.parsers import rule_parser
-from vap_core.memory import recall
+from vap_core.memory import recall, reference_rows
 from vap_core.perception.candidates import (
     Candidates,
     Proposals,
@@ -55,7 +55,7 @@ from vap_core.perception.candidates import (
     propose,
     segment,
 )
-from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
+from vap_core.perception.protocols import OF_USUAL, FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours, has_colour
 from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
@@ -298,8 +298,10 @@ class Attender:
         associations: tuple[Association | None, ...] = ()
         if self.prompting.associate:
             groundings, associations = associate_targets(groundings, cameras or {})
-        for camera, elected in groundings.items():
-            groundings[camera] = tuple(map(self.reject, elected))
+        for j, obj in enumerate(wanted):
+            judged = self.reject(obj, {camera: of[j] for camera, of in groundings.items()})
+            for camera, of in groundings.items():
+                groundings[camera] = (*of[:j], judged[camera], *of[j + 1 :])
         return self.begin(parsed, views, candidates, groundings, associations)
 
     def understand(
@@ -347,19 +349,31 @@ class Attender:
             camera, obj.name, boxes, cosine, ballot, winner=ballot.winner, masks=candidates.masks
         )
 
-    def reject(self, grounding: Grounding) -> Grounding:
-        """The grounding without a winner that is too unlike the references to be the object."""
+    def reject(
+        self, obj: PersonalObject, of_views: Mapping[str, Grounding]
+    ) -> dict[str, Grounding]:
+        """One target's groundings, without winners too unlike the references to be the object."""
         thresholds = self.stack.thresholds
         if thresholds is None or self.prompting.always_tint:
-            return grounding
-        threshold = thresholds.unfamiliar
-        if grounding.candidates.familiar:
-            threshold = thresholds.familiar
-        grounding = replace(grounding, threshold=threshold)
-        winner = grounding.winner
-        if winner is None or grounding.likeness[winner] >= threshold:
-            return grounding
-        return replace(grounding, winner=None, rejected=winner)
+            return dict(of_views)
+        familiar = thresholds.familiar
+        rows = reference_rows(obj, self.stack.encoder)
+        k = len(rows)
+        found = [g.likeness[g.winner] for g in of_views.values() if g.winner is not None]
+        if thresholds.together is not None and k > 1 and found:
+            usual = (float((rows @ rows.T).sum()) - k) / (k * (k - 1))
+            least = thresholds.together + OF_USUAL * usual
+            if max(found) < least:
+                familiar = max(familiar, least)
+        judged = {}
+        for camera, grounding in of_views.items():
+            winner = grounding.winner
+            threshold = familiar if grounding.candidates.familiar else thresholds.unfamiliar
+            grounding = replace(grounding, threshold=threshold)
+            if winner is not None and grounding.likeness[winner] < threshold:
+                grounding = replace(grounding, winner=None, rejected=winner)
+            judged[camera] = grounding
+        return judged
 
     def begin(
         self,

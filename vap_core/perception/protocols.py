@@ -147,12 +147,21 @@ def judged_by(judge: FamiliarityJudge, detector: Detector) -> Detector:
     return JudgedDetector(detector, judge)
 
 
+OF_USUAL = 0.7
+
+
 @dataclass(frozen=True)
 class Thresholds:
-    """The least `Grounding.likeness` of an object that is in view, in familiar and other views."""
+    """The least `Grounding.likeness` of an object that is in view, in familiar and other views.
+
+    `together` is about all familiar views of an episode: the object is in none of them unless the
+    best view's likeness, less `OF_USUAL` times the mean cosine among the references, reaches it. (A
+    look-alike resembles the references less than an object whose photos resemble each other.)
+    """
 
     familiar: float
     unfamiliar: float
+    together: float | None = None
 
 
 @dataclass(frozen=True)

@@ -212,14 +212,18 @@ def measure_openings(rows: Sequence[EpisodeRow], stack: Stack) -> tuple[list[Row
     table = []
     tiles = [_square(personal.crops[0])]
     for episode in opening_views(rows):
-        for view, offered in zip(episode, find_candidates(episode, stack), strict=True):
-            few, _ = nominate(view.rgb, personal, offered, stack)
+        offered = find_candidates(episode, stack)
+        elected = {}
+        for view, of_view in zip(episode, offered, strict=True):
+            few, _ = nominate(view.rgb, personal, of_view, stack)
             candidates = segment(view.rgb, few, stack)
-            grounding = attender.reject(attender.ground(view.camera, personal, candidates))
-            row = _view_row(view, offered, grounding)
+            elected[view.camera] = attender.ground(view.camera, personal, candidates)
+        judged = attender.reject(personal, elected)
+        for view, of_view in zip(episode, offered, strict=True):
+            row = _view_row(view, of_view, judged[view.camera])
             table.append(row)
             if view.row == rows[0]:
-                tiles.append(_tile(view, grounding, row))
+                tiles.append(_tile(view, judged[view.camera], row))
     first = table[0]
     title = f"{personal.name} ({first['suite']}/{first['task']})"
     return table, labelled(np.concatenate(tiles, axis=1), [title])

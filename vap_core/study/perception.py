@@ -94,9 +94,7 @@ class View:
         return {name: mask for name, mask in self.masks.items() if mask.sum() >= self.least_px}
 
 
-def opening_views(
-    rows: Sequence[EpisodeRow], size: int = GROUNDING_PX
-) -> Iterator[list[View]]:
+def opening_views(rows: Sequence[EpisodeRow], size: int = GROUNDING_PX) -> Iterator[list[View]]:
     """The views of each row in turn, by the cameras, look, control and sensor of its suite.
 
     Rows of one suite and variant share a scene and come together. Pictures are `size` pixels wide
