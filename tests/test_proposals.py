@@ -135,6 +135,26 @@ def test_what_is_unlike_the_references_is_not_tinted_and_not_named() -> None:
     assert attended.events[0].level == "WARN"
 
 
+def test_an_object_is_in_no_view_unless_one_is_as_like_it_as_its_photos_are_alike() -> None:
+    """The mug's photos are one colour: a look-alike is like enough for any single view."""
+    cameras = ("front", "side")
+    shown = {"front": scene([(4, 20, SAND)]), "side": scene([(24, 20, SAND)])}
+
+    def winners(together: float | None, views: dict[str, Rgb], **how: object) -> list[int | None]:
+        stack = replace(TOYS, thresholds=Thresholds(0.5, 0.5, together))
+        _, attended = Attender(stack, {"mug": MUG}, Prompting(**how)).start(views, "bring my cup")
+        of = [attended.groundings[camera][0] for camera in cameras]
+        assert [g.rejected is None for g in of] == [g.winner is not None for g in of]
+        assert all(g.rejected is None or g.likeness[g.rejected] < g.threshold for g in of)
+        return [g.winner for g in of]
+
+    assert winners(None, shown) == [0, 0]
+    assert winners(0.28, shown) == [None, None]
+    assert winners(0.28, shown, always_tint=True) == [0, 0]
+    assert winners(0.28, shown, references=1) == [0, 0]  # one photo is alike to none
+    assert winners(0.28, {**shown, "side": scene([(4, 20, TEAL)])}) == [0, 0]  # seen in one view
+
+
 def test_recordings_and_signals_say_not_in_view() -> None:
     from vap_core.base.pictures import result_line
     from vap_core.recording.texts import describe_vote

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.toys import TOYS, personal, scene
+from vap_core.attend import GROUNDING_PX
 from vap_core.base.types import Boxes, PersonalObject, Rgb
 from vap_core.perception.candidates import Proposals
 from vap_core.perception.protocols import Stack
@@ -195,7 +196,7 @@ def test_openings_show_each_row_as_its_suite_does() -> None:
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(first, again, strict=True))
     for v in first:
         assert set(v.masks) == {place.model for place in rows[0].placements}
-        assert v.rgb.shape == (224, 224, 3)
+        assert v.rgb.shape == (GROUNDING_PX, GROUNDING_PX, 3)
         assert v.least_px == 100
 
 

@@ -64,9 +64,10 @@ def _counts(value: Any) -> bool:
 EMBEDDED_THRESHOLDS = Thresholds(familiar=0.5, unfamiliar=0.54, together=0.165)
 """Chosen on development views, five references each. Familiar: first frames of the suites' -dev and
 -dev-absent lists at 448 px, whole or every second to fourth: 2.4 % of 546 views that elect the
-object are refused, and 32 % of 170 episodes with only look-alikes in view are tinted anywhere. Unfamiliar:
-80 pictures with objects pasted into real photos, 15 photos of one object, 7 scenes; 64 of 67 are at
-least that like it, 5 % of 869 where the kind is absent, and 25 % of 40 with only look-alikes."""
+object are refused, and 32 % of 170 episodes with only look-alikes in view are tinted anywhere.
+Unfamiliar: 80 pictures with objects pasted into real photos, 15 photos of one object, 7 scenes; 64
+of 67 are at least that like it, 5 % of 869 where the kind is absent, and 25 % of 40 with only
+look-alikes."""
 
 
 def load_embedded() -> Stack:
