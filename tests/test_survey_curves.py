@@ -87,7 +87,7 @@ def tables() -> dict[str, pd.DataFrame]:
             }
             tracks.append({**key, **about})
     agreements = [{"suite": "vlabench", "task": "t", "episode": 0, "associate": way, "case": case, "right": right, "views": 2}
-                  for way, case, right in ((OFF, "case 2", 1), ("geometry", "right", 2))]  # fmt: skip
+                  for way, case, right in ((OFF, "case 2", 1), ("associated", "right", 2))]  # fmt: skip
     took = {"start-up grounding": 200.0, "track step": 60.0, "pass": 20.0}
     speed = [
         {"what": what, "ms": ms, "low_ms": ms - 1, "high_ms": ms + 1, "rounds": 5}
@@ -135,7 +135,7 @@ def test_the_report_tells_every_part() -> None:
         "vlabench 2 of 8, simpler-bridge 1 of 4",
         "K = 7, average",
         "vlabench side",
-        "geometry",
+        "associated",
         "by the detector: 75.0",
     ):
         assert part in told

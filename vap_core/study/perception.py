@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from vap_core.associate import Sighting, associate, compare_views
-from vap_core.attend import GROUNDING_PX
+from vap_core.associate import compare_views
+from vap_core.attend import GROUNDING_PX, Attender, Prompting
 from vap_core.base.types import (
     Boxes,
     Camera,
@@ -355,64 +355,55 @@ OFF, ASSOCIATED = "off", "associated"
 
 
 def survey(episode: Sequence[View], stack: Stack, ks: Sequence[int] = KS) -> Tables:
-    """Every table of `survey_view` with its keys, and "agreements".
+    """Every table of `survey_view` with its keys.
 
-    "agreements" has a row per way to associate the views; none for a single view.
-
-    Raises: as `registered_object` and `agreements`.
+    Raises: as `registered_object`.
     """
     memory = {k: registered_object(stack, episode[0].row.target, k)[0] for k in ks}
     candidates = find_candidates(episode, stack)
-    tables: Tables = {"views": [], "objects": [], "detections": [], "choices": [], "agreements": []}
+    tables: Tables = {"views": [], "objects": [], "detections": [], "choices": []}
     for view, of_view in zip(episode, candidates, strict=True):
         for name, rows in survey_view(view, stack, memory, of_view).items():
             tables[name] += [{**view.key, **row} for row in rows]
-    if len(episode) > 1:
-        tables["agreements"] = agreements(episode, candidates, memory[USUAL_K], stack)
     return tables
 
 
-def agreements(
-    episode: Sequence[View],
-    candidates: Sequence[Proposals],
-    personal: PersonalObject,
-    stack: Stack,
-) -> list[TableRow]:
-    """What the views of an episode highlight together, by every way to associate them.
+def agreements(episode: Sequence[View], personal: PersonalObject, stack: Stack) -> list[TableRow]:
+    """What the views of an episode highlight together, one by one and associated.
 
     `case` is the comparison of the views (SPEC section 7); `right` is in how many of the `views`
     that show the target it is highlighted. A box on no object is another thing in every view.
 
-    Raises: BadViews, as `associate`; BadEncoder, as `compare`.
+    Raises: as `Attender.start`.
     """
     row = episode[0].row
-    few, sightings = {}, {}
-    for view, of_view in zip(episode, candidates, strict=True):
-        chosen = nominate(view.rgb, personal, of_view, stack)[0]
-        cosine = election_scores(compare(personal, chosen, stack), chosen.boxes)
-        few[view.camera] = chosen.boxes.xyxy
-        sightings[view.camera] = Sighting(cosine, chosen.boxes.xyxy, camera=view.optics)
-    table = []
+    images = {view.camera: view.rgb for view in episode}
+    optics = {view.camera: view.optics for view in episode if view.optics is not None}
+    shown = [view.camera for view in episode if row.target in view.visible()]
+    table: list[TableRow] = []
     for name in (OFF, ASSOCIATED):
-        found = associate(sightings) if name == ASSOCIATED else None
+        prompting = Prompting(associate=name == ASSOCIATED)
+        attender = Attender(stack, {personal.name: personal}, prompting)
+        _, attended = attender.start(images, f"bring my {personal.category}", cameras=optics)
         highlighted: dict[str, str | None] = {}
         for view in episode:
-            i = vote(sightings[view.camera].cosine).winner
-            if found is not None:
-                i = found.chosen[view.camera]
-            under = None if i is None else object_under_box(view, few[view.camera][i])
+            (grounding,) = attended.groundings[view.camera]
+            under = None
+            if grounding.winner is not None:
+                under = object_under_box(view, grounding.candidates.xyxy[grounding.winner])
             highlighted[view.camera] = f"nothing in {view.camera}" if under == "nothing" else under
-        shown = [view.camera for view in episode if row.target in view.visible()]
-        agreement: TableRow = {
-            "suite": row.suite,
-            "task": row.task,
-            "episode": row.episode,
-            "target": row.target,
-            "associate": name,
-            "case": compare_views(highlighted, row.target),
-            "right": sum(highlighted[camera] == row.target for camera in shown),
-            "views": len(shown),
-            "margin": None if found is None else found.margin,
-        }
-        table.append(agreement)
+        margins = [found.margin for found in attended.associations if found is not None]
+        table.append(
+            {
+                "suite": row.suite,
+                "task": row.task,
+                "episode": row.episode,
+                "target": row.target,
+                "associate": name,
+                "case": compare_views(highlighted, row.target),
+                "right": sum(highlighted[camera] == row.target for camera in shown),
+                "views": len(shown),
+                "margin": margins[0] if margins else None,
+            }
+        )
     return table

@@ -17,6 +17,7 @@ from vap_core.study.perception import (
     KS,
     RULES,
     USUAL_K,
+    agreements,
     opening_views,
     registered_object,
     survey,
@@ -29,6 +30,9 @@ from vap_core.study.trials import Study
 if TYPE_CHECKING:
     import pandas as pd
 
+WHOLE = 60
+"""Episodes a task, at most, of which the views are compared: those of a whole list, and of its
+development list."""
 EPISODES = {"simpler-fractal": 30, "simpler-bridge": 16, "vlabench": 8, "tabletop": 5}
 """Opening frames a task, as episodes spread evenly over its list.
 
@@ -52,10 +56,12 @@ class Job:
 
     `what` are the episodes whose opening frames are surveyed, or an episode to track; None is the
     time of its pieces, which is measured alone, so that nothing of this run disturbs it.
+    `together`: the views of each episode are compared, and nothing else is surveyed.
     """
 
     name: str
     what: tuple[EpisodeRow, ...] | tracking.Job | None
+    together: bool = False
 
     @property
     def alone(self) -> bool:
@@ -135,7 +141,21 @@ class Survey(Measurement):
                     part = rows[i : i + CHUNK]
                     episodes = f"{part[0].episode}-{part[-1].episode}"
                     jobs.append(Job(f"openings.{suite}.{task.name}.{episodes}", part))
+            if len(suites.suite(suite).cameras) > 1:
+                jobs += self._compared(suite)
         return [*jobs, Job("speed", None)]
+
+    def _compared(self, suite: str) -> list[Job]:
+        """The jobs that compare the views of the lists of a suite."""
+        most = self.n_openings(suite) if self.quick or self.episodes else WHOLE
+        jobs = []
+        for listed in (suite, suite + suites.DEVELOPMENT):
+            for task in suites.suite(listed).tasks:
+                rows = suites.rows(listed, task.name, most)
+                for i in range(0, len(rows), CHUNK):
+                    name = f"together.{listed}.{task.name}.{rows[i].episode}"
+                    jobs.append(Job(name, rows[i : i + CHUNK], together=True))
+        return jobs
 
     def run(self, job: Job, folder: Path) -> Tables:
         """Raises: as `tracking.track_episode`, `opening_views` and `survey`."""
@@ -145,6 +165,11 @@ class Survey(Measurement):
         if isinstance(job.what, tracking.Job):
             return {"tracks": tracking.track_episode(job.what, stack)}
         tables: Tables = {name: [] for name in TABLES}
+        if job.together:
+            for episode in opening_views(job.what):
+                mine, _ = registered_object(stack, episode[0].row.target, USUAL_K)
+                tables["agreements"] += agreements(episode, mine, stack)
+            return tables
         for episode in opening_views(job.what):
             for name, rows in survey(episode, stack).items():
                 tables[name] += rows
