@@ -75,6 +75,24 @@ def test_a_given_box_is_taken_and_guides_the_other_photos():
     assert second.chosen_by == "proposed"
 
 
+def test_a_crop_of_only_a_part_is_doubtful():
+    """A photo in which a part alone is found says so."""
+    whole = scene([(8, 8, RED)], side=40)
+    whole[26:34, 26:34] = GREEN
+    proposed = np.array([[8, 8, 48, 48], [26, 26, 34, 34]], np.float32)
+
+    def parts(images, phrase, threshold=None):
+        alone = [proposed[1:] if image[8, 8, 0] == 0 else proposed for image in images]
+        return [Boxes(xyxy, np.full(len(xyxy), 0.5, np.float32), phrase) for xyxy in alone]
+
+    cut = np.zeros_like(whole)
+    cut[26:34, 26:34] = (200, 100, 0)
+    references = choose_references([whole, whole, whole, cut], "cup", parts, MeanColour())
+    assert [r.box.tolist() for r in references[:3]] == [proposed[0].tolist()] * 3
+    assert [bool(r.doubt) for r in references] == [False, False, False, True]
+    assert "part of it" in references[3].doubt
+
+
 def test_a_part_of_the_object_is_not_something_else():
     """What the photo shows besides the object are rivals in the check; its parts are not."""
 
@@ -159,7 +177,7 @@ def test_photos_of_the_same_name_are_told_apart_by_their_paths(tmp_path):
         registering.parse_given(["mug-0.png=1,2,3,4"], [], photos)
     references = registering.choose(photos, "cup", STACK, {}, whole=False)
     with pytest.raises(BadPhoto, match=f"give --box {photos[0]}=") as said:
-        registering.refuse_doubtful(references, photos, tmp_path / "sheet.png")
+        registering.leave_out_doubtful(references, photos, tmp_path / "sheet.png")
     assert f"{photos[0]}: " in str(said.value)
     assert list(registering.parse_given([f"{photos[1]}=1,2,30,40"], [], photos)) == [1]
 
@@ -178,24 +196,33 @@ def test_a_sheet_says_how_every_box_was_chosen(tmp_path):
 
 
 def test_a_doubtful_crop_stops_it_with_the_photo_the_sheet_and_the_remedy(tmp_path):
-    photos = save(tmp_path, [scene([(10, 26, RED), (42, 26, GREEN)])])
-    references = registering.choose(photos, "cup", STACK, {}, whole=False)
-    sheet = tmp_path / "sheet.png"
-    registering.write_sheet(sheet, references, photos)
-    with pytest.raises(BadPhoto, match=r"mug-0.png: two things.*sheet.png.*--box mug-0.png=") as e:
-        registering.refuse_doubtful(references, photos, sheet)
-    assert len(str(e.value)) <= 300 + len(str(sheet))
-    shown = load_photo(sheet, long_side=None)
-    assert shown.shape[1] > 2 * registering.TILE_PX - 1
-    registering.refuse_doubtful(whole_photos([scene([(6, 6, RED)])]), photos, sheet)
-
-
-def test_the_remedy_can_be_pasted_where_a_name_has_spaces(tmp_path):
+    """The remedy can be pasted, where a name has spaces too, and both boxes are drawn."""
     photo = tmp_path / "my mug.png"
     Image.fromarray(scene([(10, 26, RED), (42, 26, GREEN)])).save(photo)
     references = registering.choose([photo], "cup", STACK, {}, whole=False)
-    with pytest.raises(BadPhoto, match="give --box 'my mug.png'=x0,y0,x1,y1 in"):
-        registering.refuse_doubtful(references, [photo], tmp_path / "sheet.png")
+    sheet = tmp_path / "sheet.png"
+    with pytest.raises(BadPhoto, match=r"my mug.png: two things.*or pass --accept.*sheet.png") as e:
+        registering.leave_out_doubtful(references, [photo], sheet)
+    for box in ("10,26,22,38 (box 1)", "42,26,54,38 (box 2)"):
+        assert f"--box 'my mug.png'={box}" in str(e.value)
+    shown = load_photo(sheet, long_side=None)
+    scale = registering.TILE_PX / 64
+    for x in (10, 42):
+        assert shown[round(32 * scale), round(x * scale)].tolist() == list(registering.DOUBTFUL)
+    good = whole_photos([scene([(6, 6, RED)])])
+    assert registering.leave_out_doubtful(good, [photo], sheet) == ([0], [])
+
+
+def test_a_doubtful_photo_is_left_out_where_three_are_good(tmp_path):
+    mine = [scene([(26, y, RED)]) for y in (20, 26, 32)]
+    photos = save(tmp_path, [*mine, scene([(26, 26, BLUE)])])
+    references = registering.choose(photos, "cup", STACK, {}, whole=False)
+    good, (line,) = registering.leave_out_doubtful(references, photos, tmp_path / "sheet.png")
+    assert good == [0, 1, 2]
+    assert line.startswith("mug-3.png: what was found is unlike the other photos")
+    assert line.endswith("give --box mug-3.png=26,26,38,38 (box 1)")
+    with pytest.raises(BadPhoto, match="unlike the other photos"):
+        registering.leave_out_doubtful(references[1:], photos[1:], tmp_path / "sheet.png")
 
 
 def test_leave_one_out_finds_what_the_references_confuse():

@@ -138,7 +138,7 @@ def test_a_refused_replacement_leaves_the_sheet_of_the_object_that_stays(
     two = photo(tmp_path / "two.png", GREEN, BLUE)
     line = refused(*words_of(bank, "mug"), two, "--replace")
     assert "two things in it could be meant" in line
-    assert f"look at {doubtful}" in line
+    assert f"Look at {doubtful}" in line
     assert doubtful.exists()
     assert sheet.read_bytes() == before
     done = vap(*words_of(bank, "mug"), two, "--replace", "--accept")

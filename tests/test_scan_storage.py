@@ -1,16 +1,22 @@
 """A scan's folder is replaced whole: killed at any moment, the former or the new scan is there."""
 
+import io
+import json
 import subprocess
 import sys
 import zlib
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
 from tests.command import vap
+from tests.test_media import claims
+from vap_core.base import files
 from vap_core.base.errors import BadObject, BadOutput
 from vap_core.simulation.assets.scans import storage
 from vap_core.simulation.assets.scans.storage import Scan, ScanMetadata
@@ -93,6 +99,43 @@ def test_whatever_a_decoder_raises_is_one_line(
     monkeypatch.setitem(storage.DECODERS, storage.MESH_FILE, decode)
     with pytest.raises(BadObject, match=r"mesh.npz lacks what an object needs \(odd\)"):
         storage._load_version(shelf / "mug", -1)
+
+
+def unpacked(**arrays: np.ndarray) -> bytes:
+    whole = io.BytesIO()
+    np.savez_compressed(whole, **arrays)
+    return whole.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("file", "data", "words"),
+    [
+        ("mesh.npz", unpacked(vertex=np.zeros(3_000_000)), "over 20 MB unpacked"),  # it was read
+        ("hulls.npz", unpacked(a=np.zeros(3_000_000)), "over 20 MB unpacked"),
+        ("mesh.npz", unpacked(vertex=np.full((3, 3), np.nan)), "numbers that are not finite"),
+        ("hulls.npz", unpacked(a=np.zeros(3)), "no hulls"),
+        ("texture.png", claims(8000), "texture.png cannot be read as an image, it is none of PNG"),
+    ],
+)
+def test_a_file_of_a_stranger_is_read_within_limits(
+    shelf: Path, monkeypatch: pytest.MonkeyPatch, file: str, data: bytes, words: str
+) -> None:
+    monkeypatch.setattr(storage, "UNPACKED_BYTES", 20_000_000)
+    about = json.loads((shelf / "mug" / "object.json").read_text())
+    about["sha256"][file] = sha256(data).hexdigest()
+    (shelf / "mug" / "object.json").write_text(json.dumps(about))
+    (shelf / "mug" / file).write_bytes(data)
+    with pytest.raises(BadObject, match=f"{file} lacks what an object needs .{words}"):
+        storage.load_scan(shelf / "mug")
+
+
+def test_a_table_is_read_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 MB of zeros took 3 GB."""
+    monkeypatch.setattr(files, "LARGEST_BYTES", 1_000_000)
+    pd.DataFrame({"a": np.zeros(1_000_000)}).to_parquet(tmp_path / "a.parquet")
+    assert (tmp_path / "a.parquet").stat().st_size < 100_000
+    with pytest.raises(BadOutput, match=r"a\.parquet cannot be opened \(over 0\.001 GB unpacked"):
+        files.read_arrow(tmp_path / "a.parquet", "report", "publish it again")
 
 
 def test_metadata_nested_too_deep_is_damaged(shelf: Path) -> None:

@@ -311,10 +311,14 @@ def read_arrow(path: Path, caller: str, remedy: str) -> "pa.Table":
         opened: then nothing says that it is damaged.
     """
     from pyarrow import ArrowException
-    from pyarrow.parquet import read_table
+    from pyarrow.parquet import read_metadata, read_table
 
     try:
         check_regular(path)
+        about = read_metadata(path)
+        sizes = [about.row_group(i).total_byte_size for i in range(about.num_row_groups)]
+        if max(sum(sizes), 8 * about.num_rows * about.num_columns) > LARGEST_BYTES:
+            raise OSError(errno.ENOMEM, f"over {LARGEST_BYTES / 1e9:g} GB unpacked")
         return read_table(path)
     except (UnicodeEncodeError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in UNOPENED:

@@ -120,10 +120,13 @@ def register(
     _print_unknown([category], stack)
     references = registering.choose(paths, category, models, given, whole=whole)
     doubtful = memory / f"{name}.doubtful.png"
+    kept, notes = [*range(len(paths))], list[str]()
     if not accept:
-        registering.refuse_doubtful(references, paths, doubtful)
-    obj = registering.remember_references(name, category, references, models)
-    for line in warnings(obj, references, [path.name for path in paths]):
+        kept, notes = registering.leave_out_doubtful(references, paths, doubtful)
+    used = [references[i] for i in kept]
+    obj = registering.remember_references(name, category, used, models)
+    notes = [f"left out: {line}" for line in notes]
+    for line in (*notes, *warnings(obj, used, [paths[i].name for i in kept])):
         print(f"note: {line}", file=sys.stderr)
     obj = with_description(obj, load_captioner(models.segmenter, describe))
     obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
@@ -134,7 +137,7 @@ def register(
     with suppress(OSError):
         doubtful.unlink(missing_ok=True)
     print(f"look at the crops: {sheet}")
-    print(leave_one_out(obj, references, {**known, name: obj}, models.encoder))
+    print(leave_one_out(obj, used, {**known, name: obj}, models.encoder))
     print(f"next: {command(*registering.next_words(obj, memory, stack, known))}")
 
 

@@ -1,10 +1,12 @@
 """Which box of each reference photo shows the object: what all photos of it have in common.
 
 Every box that the detector proposes is a candidate. One that resembles some box of every other
-photo, lies near the middle and is not small is chosen; a doubtful choice says why.
+photo, lies near the middle and is not small is chosen. Then the chosen boxes vote on each other
+until they agree; a doubtful choice says why.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -25,17 +27,27 @@ SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
 the cosine to the other photos."""
 PRIOR_WEIGHT = 2.0
 """Of a box's prior, which takes the place of its score where a detector gives it."""
+ROUNDS = 4
+"""How often boxes are chosen: first by all boxes of the other photos, then by the chosen ones."""
 RIVAL_IOU = 0.5
 """A box that overlaps the chosen one by less would be another crop."""
 ELSEWHERE = 0.1
 """A box shows something else when less than this share of the smaller of both is common."""
+FEWEST = 3
+"""Photos from which on their votes decide, and references that are enough."""
+AGREED = 2 / 3
+"""Share of the other photos' votes below which a choice is doubtful."""
 CLOSE, CLOSE_ALONE = 0.05, 0.1
-"""Another crop that scores nearer to the chosen one than this makes it doubtful; the second holds
-for a single photo."""
+"""Another crop that scores nearer to the chosen one than this by all that the other photos show
+makes it doubtful: any of fewer photos than FEWEST, else one that shows something else. The second
+holds for a single photo."""
 LEAST_COSINE = 0.5
-"""Mean cosine to the best boxes of the other photos, below which the choice is doubtful."""
+"""Mean cosine to the chosen boxes of the other photos, below which the choice is doubtful."""
 SMALL_SHARE = 0.01
 """Of a photo's area: a smaller box is more likely a part of the object."""
+PART_SIZE, PART_COSINE = 0.25, 0.05
+"""A crop is more likely a part where it is smaller than this share of the usual crop, and that much
+less like the other photos' crops than is usual."""
 SMALL_PX = 64
 """The shorter side of a crop, below which little detail is left to compare."""
 Box = Float32[np.ndarray, "4"]
@@ -48,7 +60,8 @@ class Reference:
 
     `agreement` is the mean cosine of the crop to the best crop of every other photo, nan for a
     single photo. `doubt` says why the box may be wrong, "" where nothing speaks against it.
-    `others` are crops of the photo that show something else.
+    `rival` is the next best box of a photo, another crop. `others` are crops of the photo that show
+    something else.
     """
 
     photo: Rgb
@@ -56,6 +69,7 @@ class Reference:
     chosen_by: ChosenBy
     agreement: float
     doubt: str
+    rival: Box | None
     others: tuple[Rgb, ...]
 
     @property
@@ -90,14 +104,35 @@ def choose_references(
         fault = row_fault(rows[i], rows[0])
         if fault:
             raise BadEncoder(describe_fault("remember", encoder, fault))
-    references = []
-    for i, photo in enumerate(photos):
-        others = [part for part in rows[:i] + rows[i + 1 :] if len(part)]
-        # Of every box, the mean cosine to the most similar box of each other photo.
-        best = [(rows[i] @ other.T).max(axis=1) for other in others]
-        support = np.mean(best, axis=0) if others else np.full(len(rows[i]), np.nan)
-        references.append(_choose(photo, proposals[i], support, i in boxes_given))
-    return tuple(references)
+    priors = [_prior(photo, boxes) for photo, boxes in zip(photos, proposals, strict=True)]
+    shown = rows
+    first: list[np.ndarray] = []
+    for _ in range(ROUNDS):
+        # Of every other photo, the cosine of what it shows to every box of this one.
+        ballots = []
+        for i, part in enumerate(rows):
+            others = [other for other in shown[:i] + shown[i + 1 :] if len(other)]
+            cosines = [(part @ other.T).max(axis=1) for other in others]
+            ballots.append(np.array(cosines, np.float32).reshape(len(cosines), len(part)))
+        first = first or ballots
+        best = [
+            0 if i in boxes_given else int(_score(prior, ballot).argmax()) if len(prior) else 0
+            for i, (prior, ballot) in enumerate(zip(priors, ballots, strict=True))
+        ]
+        shown = [part[k : k + 1] for part, k in zip(rows, best, strict=True)]
+    references = [
+        _choose(photos[i], proposals[i], best[i], first[i], ballots[i], i in boxes_given)
+        for i in range(len(photos))
+    ]
+    size = np.array([(r.box[2:] - r.box[:2]).prod() / r.photo[..., 0].size for r in references])
+    cosine = np.array([r.agreement for r in references])
+    small = (size < PART_SIZE * np.median(size)) & (cosine < np.median(cosine) - PART_COSINE)
+    return tuple(
+        replace(r, doubt="what was found may be a part of it")
+        if is_small and r.chosen_by == "proposed" and not r.doubt
+        else r
+        for r, is_small in zip(references, small, strict=True)
+    )
 
 
 def whole_photos(photos: Sequence[Rgb]) -> tuple[Reference, ...]:
@@ -125,17 +160,25 @@ def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) 
 
 
 def _choose(
-    photo: Rgb, boxes: Boxes, support: Float[np.ndarray, " n"], is_given: bool
+    photo: Rgb,
+    boxes: Boxes,
+    best: int,
+    first: Float[np.ndarray, "k n"],
+    ballots: Float[np.ndarray, "k n"],
+    is_given: bool,
 ) -> Reference:
     if not len(boxes):
         return _whole(photo, f"no {boxes.phrase} was found in it")
-    score = _prior(photo, boxes) + np.nan_to_num(support)
-    best = 0 if is_given else int(score.argmax())
+    prior = _prior(photo, boxes)
+    enough = len(ballots) + 1 >= FEWEST
+    score = _score(prior, first)
     chosen = boxes.xyxy[best : best + 1]
-    elsewhere = np.flatnonzero(box_cover(chosen, boxes.xyxy)[0] < ELSEWHERE)
-    agreement = float(support[best])  # nan for a single photo
-    rivals = score[box_iou(chosen, boxes.xyxy)[0] < RIVAL_IOU]
-    close = CLOSE_ALONE if np.isnan(agreement) else CLOSE
+    agreement = float(ballots[:, best].mean()) if len(ballots) else float("nan")
+    rivals = box_iou(chosen, boxes.xyxy)[0] < RIVAL_IOU
+    apart = box_cover(chosen, boxes.xyxy)[0] < ELSEWHERE
+    lead = np.where(rivals, score[best] - score, np.inf)
+    close = lead < (CLOSE if len(ballots) else CLOSE_ALONE)
+    outvoted = enough and rivals[(prior + ballots).argmax(axis=1)].mean() > 1 - AGREED
     doubt = ""
     if is_given:
         pass
@@ -143,11 +186,18 @@ def _choose(
         doubt = "what was found is a small part of it"
     elif agreement < LEAST_COSINE:
         doubt = f"what was found is unlike the other photos (cosine {agreement:.2f})"
-    elif len(rivals) and rivals.max() > score[best] - close:
+    elif outvoted or (close & (apart if enough else True)).any():
         doubt = "two things in it could be meant"
-    others = tuple(crop(photo, boxes.xyxy[i]) for i in elsewhere)
+    rival = boxes.xyxy[lead.argmin()] if rivals.any() else None
+    others = tuple(crop(photo, box) for box in boxes.xyxy[apart])
     chosen_by: ChosenBy = "given" if is_given else "proposed"
-    return Reference(photo, chosen[0], chosen_by, agreement, doubt, others)
+    return Reference(photo, chosen[0], chosen_by, agreement, doubt, rival, others)
+
+
+def _score(
+    prior: Float[np.ndarray, " n"], ballots: Float[np.ndarray, "k n"]
+) -> Float[np.ndarray, " n"]:
+    return prior + ballots.mean(axis=0) if len(ballots) else prior
 
 
 def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
@@ -164,4 +214,4 @@ def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
 def _whole(photo: Rgb, doubt: str) -> Reference:
     height, width = photo.shape[:2]
     box = np.array([0, 0, width, height], np.float32)
-    return Reference(photo, box, "whole", float("nan"), doubt, ())
+    return Reference(photo, box, "whole", float("nan"), doubt, None, ())

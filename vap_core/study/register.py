@@ -1,6 +1,7 @@
 """Remembers an object from photos as a person takes them, and says how far its vote can be trusted.
 
-A box is chosen in every photo, all are shown on a contact sheet, and a doubtful one stops it.
+A box is chosen in every photo, and all are shown on a contact sheet. Doubtful ones are left out;
+where too few are good they stop it.
 """
 
 import os.path
@@ -24,6 +25,7 @@ from vap_core.perception.boxes import mask_box
 from vap_core.perception.candidates import embed_crops
 from vap_core.perception.protocols import Encoder, Stack
 from vap_core.perception.references import (
+    FEWEST,
     LEAST_COSINE,
     SMALL_PX,
     Box,
@@ -201,24 +203,37 @@ def choose(
     return choose_references(pictures, category, stack.detector, stack.encoder, given)
 
 
-def refuse_doubtful(references: Sequence[Reference], photos: Sequence[Path], sheet: Path) -> None:
-    """Stop at crops that may be wrong, after writing their sheet.
+def leave_out_doubtful(
+    references: Sequence[Reference], photos: Sequence[Path], sheet: Path
+) -> tuple[list[int], list[str]]:
+    """The numbers of the good crops, and a line about each that may be wrong.
 
-    Raises: BadPhoto, which names the sheet and the first photo whose crop may be wrong; BadOutput.
+    Raises: BadPhoto: some may be wrong, and fewer than FEWEST are good; BadOutput. The sheet of all
+        is written then.
     """
-    doubtful = [i for i, reference in enumerate(references) if reference.doubt]
-    if not doubtful:
-        return
-    write_sheet(sheet, references, photos)
-    first = doubtful[0]
-    name = _shortest_name(photos[first], photos)
-    more = ""
-    if len(doubtful) > 1:
-        more = f" ({len(doubtful) - 1} more are doubtful)"
-    raise BadPhoto(
-        f"register: {name}: {references[first].doubt}{more}; look at {sheet}, then give --box "
-        f"{shlex.quote(name)}=x0,y0,x1,y1 in pixels, or pass --accept."
-    )
+    good = [i for i, reference in enumerate(references) if not reference.doubt]
+    lines = []
+    for reference, photo in zip(references, photos, strict=True):
+        name = shlex.quote(_shortest_name(photo, photos))
+        ready = [
+            f"--box {name}={','.join(map(str, np.rint(box).astype(int)))} (box {k + 1})"
+            for k, box in enumerate(alternatives(reference))
+        ]
+        remedy = " or ".join(ready) or f"--box {name}=x0,y0,x1,y1 in pixels"
+        if reference.doubt:
+            lines.append(f"{_shortest_name(photo, photos)}: {reference.doubt}; give {remedy}")
+    if lines and len(good) < FEWEST:
+        write_sheet(sheet, references, photos)
+        raise BadPhoto(f"register: {'; '.join(lines)}; or pass --accept. Look at {sheet}.")
+    return good, lines
+
+
+def alternatives(reference: Reference) -> list[Box]:
+    """What could be meant in a doubtful photo, the chosen box first."""
+    boxes = [reference.box, reference.rival]
+    if not reference.doubt or reference.chosen_by == "whole":
+        return []
+    return [box for box in boxes if box is not None]
 
 
 def remember_references(
@@ -247,6 +262,10 @@ def write_sheet(path: Path, references: Sequence[Reference], photos: Sequence[Pa
         shown, scale = fit(reference.photo, TILE_PX, TILE_PX)
         colour = DOUBTFUL if reference.doubt else RIGHT
         draw_box(shown, (scale * reference.box).tolist(), colour, 2)
+        for k, box in enumerate(alternatives(reference)):
+            x0, y0, *_ = corners = (scale * box).tolist()
+            draw_box(shown, corners, colour, 2)
+            cv2.putText(shown, str(k + 1), (int(x0) + 6, int(y0) + 20), 0, 0.6, colour, 2)
         crop, _ = fit(reference.crop, TILE_PX, TILE_PX)
         verdict = reference.doubt or describe_choice(reference)
         tiles.append(labelled(np.concatenate([shown, crop], axis=1), [photo.name, verdict]))
@@ -377,10 +396,6 @@ def _parse_box(text: str, words: str) -> Box:
             f"register: --box {text!r} has no area; x to the right, y down, far corner last."
         )
     return np.array([x0, y0, x1, y1], np.float32)
-
-
-FEWEST = 3
-"""References that are needed before one can be left out."""
 
 
 @value

@@ -308,10 +308,10 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         out.mkdir(parents=True)
         made = True
         beside = [file.name for file in source.iterdir() if file.is_file()]
-        names = {name for pattern in WANTED_FILES for name in fnmatch.filter(beside, pattern)}
-        for name in {*map(Path, names), *deciding_files(source)} - {Path(PIPELINES[0])}:
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            os.symlink(source / name, out / name)
+        wanted = [Path(name) for kind in WANTED_FILES for name in fnmatch.filter(beside, kind)]
+        for part in {*wanted, *deciding_files(source)} - {Path(PIPELINES[0])}:
+            (out / part).parent.mkdir(parents=True, exist_ok=True)
+            os.symlink(source / part, out / part)
         (out / PIPELINES[0]).write_text(json.dumps(pipeline, indent=2))
     except OSError as error:
         if made:

@@ -16,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 from PIL import Image
@@ -31,6 +32,8 @@ VARIABLE = "VAP_OBJECTS"
 MESH_FILE, HULLS_FILE, TEXTURE_FILE = FILES = ("mesh.npz", "hulls.npz", "texture.png")
 METADATA_FILE = "object.json"
 FORMER, STAGE = ".old", ".stage-"
+UNPACKED_BYTES = 500_000_000
+"""Of a mesh or its hulls: zeros pack a thousandfold."""
 REMEDY = "import the object again with --replace, or delete its folder"
 
 
@@ -218,7 +221,7 @@ def _decode_mesh(data: bytes) -> Mesh:
 
 def _decode_hulls(data: bytes) -> tuple[Hull, ...]:
     arrays = _decode_arrays(data)
-    if not arrays:
+    if len(arrays) < 2:
         raise ValueError("no hulls")
     names = (f"{i:02d}" for i in range(len(arrays) // 2))
     return tuple(Hull(arrays[f"{n}.vertex"], float(arrays[f"{n}.volume"])) for n in names)
@@ -250,5 +253,11 @@ def _read_metadata(folder: Path) -> tuple[ScanMetadata, dict[str, str]]:
 
 
 def _decode_arrays(data: bytes) -> dict[str, np.ndarray]:
+    with ZipFile(io.BytesIO(data)) as packed:
+        if sum(part.file_size for part in packed.infolist()) > UNPACKED_BYTES:
+            raise ValueError(f"over {UNPACKED_BYTES / 1e6:.0f} MB unpacked")
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        return dict(file)
+        arrays = dict(file)
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        raise ValueError("numbers that are not finite")
+    return arrays
