@@ -190,6 +190,7 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     from vap_core.rollout.loop import rollout
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.study import diagnosis, steps, store
+    from vap_core.study.perception import opening_views
     from vap_core.study.trials import DEMO, make_trial, register_personal
     from vap_make.perception.backbone import features
 
@@ -203,6 +204,8 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     attender = trial.prompter.attender
     camera = trial.scene.cameras[-1]  # on the wrist; what stays as it was costs nothing
     views = [{camera: frame.images[camera]} for frame in episode.frames]
+    (opening,) = opening_views([row])
+    larger = {view.camera: view.rgb for view in opening if view.camera == camera}
     (state, _), turn = attender.start(views[0], row.instruction), iter(range(10**6))
     noise = np.random.default_rng(0).integers(0, 255, (224, 224, 3), dtype=np.uint8)
     run = folder / "run"
@@ -235,7 +238,12 @@ def step(folder: Path, quick: bool) -> list[Arm]:
     works: list[tuple[str, str, Callable[[], object], int]] = [
         ("a view", "backbone pass", lambda: features([noise + next(turn)], ["head"]), 1),
         ("a view", "attend step", follow, 1),
-        ("a view", "grounding", lambda: attender.start(views[0], row.instruction), 1),
+        (
+            "a view",
+            "grounding",
+            lambda: attender.start(views[0], row.instruction, larger=larger),
+            1,
+        ),
         ("a control step", "rollout", roll, n),
         ("a control step", "recording, JPEG", lambda: record(False), n),
         ("a control step", "recording, AV1", lambda: record(True), n),

@@ -222,7 +222,7 @@ ABLATIONS: dict[str, Ablation] = {
         arms={},
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
-        retired=6,
+        retired=7,
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",
