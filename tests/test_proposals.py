@@ -28,7 +28,7 @@ from vap_core.perception.embedded.proposer import (
 )
 from vap_core.perception.protocols import Detector, Stack, Thresholds
 from vap_core.prompt import PALETTE, tint
-from vap_core.vote import MOST_CANDIDATES, shortlist, vote
+from vap_core.vote import MOST_CANDIDATES, RULES, shortlist, vote
 
 TEAL, SAND = (40, 120, 110), (150, 140, 130)
 CUP_BOX, BOWL_BOX = (4, 20, 16, 32), (24, 20, 36, 32)
@@ -104,8 +104,10 @@ def test_a_vote_among_the_candidates_is_one_among_all_proposals(seed: int, n: in
     assert kept[few.winner] == whole.winner
     assert few.votes.tolist() == whole.votes[kept].tolist()
     assert (few.margin, whole.votes.sum()) == (whole.margin, few.votes.sum())
-    assert len(kept) <= max(MOST_CANDIDATES, len(np.unique(cosine.argmax(axis=0))))
-    others = [i for i in kept if not whole.votes[i]]
+    for rule in RULES:
+        assert kept[vote(cosine[kept], rule).winner] == vote(cosine, rule).winner
+    assert len(kept) <= max(MOST_CANDIDATES, 1 + len(np.unique(cosine.argmax(axis=0))))
+    others = [i for i in kept if not whole.votes[i] and i != cosine.mean(axis=1).argmax()]
     cover = box_cover(xyxy[others], xyxy[kept])
     assert n <= MOST_CANDIDATES or ((cover > 0.5).sum(axis=1) == 1).all()
 

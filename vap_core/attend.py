@@ -55,7 +55,7 @@ from vap_core.perception.candidates import (
     propose,
     segment,
 )
-from vap_core.perception.protocols import OF_USUAL, FamiliarityJudge, Stack, TargetTracker
+from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours, has_colour
 from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
@@ -64,6 +64,9 @@ GROUNDING_PX = 448
 than the policy sees."""
 LEAST_COVER = 0.4
 """Share of a pixel that a mask of a larger view covers, from which on it is of the mask."""
+OF_AGREEMENT = 0.7
+"""How much of their likeness to each other the references lend to an object that is in view: where
+they are very alike, a look-alike is like them, too."""
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
 
@@ -284,15 +287,15 @@ class Attender:
         candidates: dict[str, tuple[Candidates, ...]] = {}
         groundings: dict[str, PerTarget] = {}
         for camera, rgb in looked_at.items():
-            of_view: list[Candidates] = []
+            found: list[Candidates] = []
+            carried: list[Candidates] = []
             per_target = []
             for phrase, obj in zip(phrases, wanted, strict=True):
-                offered = proposals[camera][phrase]
-                few, cosine = nominate(rgb, obj, offered, self.stack)
-                of_view.append(segment(rgb, few, self.stack, known=of_view))
-                carried = _carry(of_view[-1], rgb, views[camera])
-                per_target.append(self.ground(camera, obj, carried, cosine))
-            candidates[camera] = tuple(_carry(part, rgb, views[camera]) for part in of_view)
+                few, cosine = nominate(rgb, obj, proposals[camera][phrase], self.stack)
+                found.append(segment(rgb, few, self.stack, known=found))
+                carried.append(_carry(found[-1], rgb, views[camera]))
+                per_target.append(self.ground(camera, obj, carried[-1], cosine))
+            candidates[camera] = tuple(carried)
             groundings[camera] = tuple(per_target)
 
         associations: tuple[Association | None, ...] = ()
@@ -357,12 +360,16 @@ class Attender:
         if thresholds is None or self.prompting.always_tint:
             return dict(of_views)
         familiar = thresholds.familiar
-        rows = reference_rows(obj, self.stack.encoder)
-        k = len(rows)
-        found = [g.likeness[g.winner] for g in of_views.values() if g.winner is not None]
+        found = [
+            float(g.likeness[g.winner])
+            for g in of_views.values()
+            if g.winner is not None and g.candidates.familiar
+        ]
+        k = len(obj.crops)
         if thresholds.together is not None and k > 1 and found:
-            usual = (float((rows @ rows.T).sum()) - k) / (k * (k - 1))
-            least = thresholds.together + OF_USUAL * usual
+            rows = reference_rows(obj, self.stack.encoder)
+            agreement = (float((rows @ rows.T).sum()) - k) / (k * (k - 1))
+            least = thresholds.together + OF_AGREEMENT * agreement
             if max(found) < least:
                 familiar = max(familiar, least)
         judged = {}

@@ -89,15 +89,16 @@ def shortlist(
 ) -> Int64[np.ndarray, " m"]:
     """Which proposals are candidates, in their order, given their cosines with the references.
 
-    All that a reference votes for, so that a vote among the candidates is one among all proposals;
-    then, up to `most`, those of the best mean score in other places.
+    All that a reference votes for and the one of the best mean score, so that an election among the
+    candidates is one among all proposals; then, up to `most`, the next by mean in other places.
     """
     if len(boxes) <= most:
         return np.arange(len(boxes))
     scores = election_scores(cosine, boxes)
     cover = box_cover(boxes.xyxy, boxes.xyxy)
-    kept = np.unique(best_of_references(scores)).tolist()
-    for i in np.argsort(-scores.astype(np.float64).mean(axis=1), kind="stable").tolist():
+    by_mean = np.argsort(-scores.astype(np.float64).mean(axis=1), kind="stable")
+    kept = np.union1d(best_of_references(scores), by_mean[:1]).tolist()
+    for i in by_mean.tolist():
         if len(kept) < most and cover[i, kept].max() <= SAME_PLACE:
             kept.append(i)
     return np.sort(np.array(kept, np.int64))

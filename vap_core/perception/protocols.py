@@ -147,16 +147,13 @@ def judged_by(judge: FamiliarityJudge, detector: Detector) -> Detector:
     return JudgedDetector(detector, judge)
 
 
-OF_USUAL = 0.7
-
-
 @dataclass(frozen=True)
 class Thresholds:
     """The least `Grounding.likeness` of an object that is in view, in familiar and other views.
 
     `together` is about all familiar views of an episode: the object is in none of them unless the
-    best view's likeness, less `OF_USUAL` times the mean cosine among the references, reaches it. (A
-    look-alike resembles the references less than an object whose photos resemble each other.)
+    best view's likeness, less `attend.OF_AGREEMENT` times the mean cosine among the references,
+    reaches it.
     """
 
     familiar: float
