@@ -381,7 +381,7 @@ def agreements(episode: Sequence[View], personal: PersonalObject, stack: Stack) 
     optics = {view.camera: view.optics for view in episode if view.optics is not None}
     shown = [view.camera for view in episode if row.target in view.visible()]
     table: list[TableRow] = []
-    for name in (OFF, ASSOCIATED):
+    for name in (OFF, ASSOCIATED) if len(episode) > 1 else (OFF,):
         prompting = Prompting(associate=name == ASSOCIATED)
         attender = Attender(stack, {personal.name: personal}, prompting)
         _, attended = attender.start(images, f"bring my {personal.category}", cameras=optics)

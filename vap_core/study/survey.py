@@ -30,9 +30,9 @@ from vap_core.study.trials import Study
 if TYPE_CHECKING:
     import pandas as pd
 
-WHOLE = 60
-"""Episodes a task, at most, of which the views are compared: those of a whole list, and of its
-development list."""
+WHOLE, ABSENT = 60, 12
+"""Episodes a task, at most, of which the views are compared: of the lists with several cameras and
+their development lists, and of every list without its targets."""
 EPISODES = {"simpler-fractal": 30, "simpler-bridge": 16, "vlabench": 8, "tabletop": 5}
 """Opening frames a task, as episodes spread evenly over its list.
 
@@ -141,17 +141,19 @@ class Survey(Measurement):
                     part = rows[i : i + CHUNK]
                     episodes = f"{part[0].episode}-{part[-1].episode}"
                     jobs.append(Job(f"openings.{suite}.{task.name}.{episodes}", part))
-            if len(suites.suite(suite).cameras) > 1:
-                jobs += self._compared(suite)
+            jobs += self._compared(suite)
         return [*jobs, Job("speed", None)]
 
     def _compared(self, suite: str) -> list[Job]:
-        """The jobs that compare the views of the lists of a suite."""
-        most = self.n_openings(suite) if self.quick or self.episodes else WHOLE
+        """The jobs that compare the views of an episode, over the lists of a suite."""
+        lists = {suite + suites.ABSENT: ABSENT}
+        if len(suites.suite(suite).cameras) > 1:
+            lists |= {suite: WHOLE, suite + suites.DEVELOPMENT: WHOLE}
         jobs = []
-        for listed in (suite, suite + suites.DEVELOPMENT):
+        for listed, most in lists.items():
             for task in suites.suite(listed).tasks:
-                rows = suites.rows(listed, task.name, most)
+                n = self.n_openings(suite) if self.quick or self.episodes else most
+                rows = suites.rows(listed, task.name, n)
                 for i in range(0, len(rows), CHUNK):
                     name = f"together.{listed}.{task.name}.{rows[i].episode}"
                     jobs.append(Job(name, rows[i : i + CHUNK], together=True))
