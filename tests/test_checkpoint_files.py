@@ -228,7 +228,7 @@ def test_no_door_reads_beyond_the_folder(copy: Path, tmp_path: Path, door: str) 
         DOORS[door](copy, tmp_path)
     (copy / "config.json").unlink()
     (copy / "config.json").symlink_to("/dev/zero")
-    with pytest.raises(BadPolicy, match="lacks config.json"):
+    with pytest.raises(BadPolicy, match=r"lacks config\.json|it is no regular file"):
         DOORS[door](copy, tmp_path)
 
 

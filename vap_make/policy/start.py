@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vap_core.base.errors import BadPolicy, first_line
-from vap_core.policies.lerobot.checkpoints import locate, refuse_code
+from vap_core.base.files import check_regular
+from vap_core.policies.lerobot.checkpoints import CONFIG, PIPELINES, WEIGHTS, refuse_code
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.vlm import MiniVlm
 from vap_core.policies.names import SHIPPED
@@ -57,7 +58,9 @@ def read_start(folder: Path, teacher: MiniVlm | None, seed: int) -> Start:
 
     torch.manual_seed(seed)
     try:
-        refuse_code(locate(folder))
+        for name in (CONFIG, WEIGHTS, *PIPELINES):
+            check_regular(folder / name)
+        refuse_code(folder)
         config = cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder))
         learner = Learner(config)
         learner.policy.load_state_dict(load_file(folder / "model.safetensors"))
