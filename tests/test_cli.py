@@ -34,13 +34,15 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def line(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
-    """One picture of a look-alike, the personal cup and another look-alike side by side, and the three boxes."""
+    """One picture of a look-alike, the personal cup and another look-alike side by side, and a box around each."""
     names = ("cup-lookalike-1", "cup-personal", "cup-lookalike-2")
     tiles = [reference_views(get_object(name), n=1, seed=9)[0] for name in names]
     path = tmp_path_factory.mktemp("line") / "line.png"
     Image.fromarray(np.concatenate(tiles, axis=1)).save(path)
     height, width = tiles[0].shape[:2]
-    return path, [f"{i * width},0,{(i + 1) * width},{height}" for i in range(3)]
+    x, y = width // 6, height // 6
+    boxes = [(i * width + x, y, (i + 1) * width - x, height - y) for i in range(3)]
+    return path, [",".join(map(str, box)) for box in boxes]
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +122,7 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (
         1,
-        "bring the red cup",
+        "bring the blue cup",  # a heart is red
         5,
     )
     assert np.array(answer["similarity"]).shape == (3, 5)
@@ -139,13 +141,13 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     assert not again.stderr
     implicit = ("bring the one I used last", "--parser", "embedding", "--memory", bank)
     done = vap("ground", image, *implicit, "--out", tmp_path, *hand)
-    assert "instruction: bring the red cup" in done.stdout, done.stderr
+    assert "instruction: bring the blue cup" in done.stdout, done.stderr
     down = ("bring my cup", "--parser", "http://127.0.0.1:9/v1", "--memory", bank)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENAI_MODEL", "reader-1")
         assert "is the server up" in refused("ground", image, *down, "--out", tmp_path, *hand)
         done = vap("ground", image, *down, "--fall-back", "--out", tmp_path, *hand)
-    assert "instruction: bring the red cup" in done.stdout
+    assert "instruction: bring the blue cup" in done.stdout
     assert "The rule parses instead." in done.stderr
     assert len(read_uses(bank)) >= 3
     assert {use.object for use in read_uses(bank)} == {"mug"}
@@ -271,7 +273,7 @@ def test_ground_refuses_a_damaged_memory(
     whole = next(bank.iterdir()).read_bytes()
     (tmp_path / "mug.object.safetensors").write_bytes(whole[: len(whole) // 2])
     assert "register the object again" in refused(
-        "ground", line[0], "bring my cup", "--memory", tmp_path, "--box", line[1][0]
+        "ground", line[0], "bring my cup", "--memory", tmp_path, "--box", line[1][1]
     )
 
 
@@ -306,7 +308,7 @@ def test_a_picture_in_the_output_folder_is_never_overwritten(
     mine = tmp_path / "mine.png"
     mine.write_bytes(line[0].read_bytes())
     done = vap(
-        "ground", mine, "bring my cup", "--memory", bank, "--out", tmp_path, "--box", line[1][0]
+        "ground", mine, "bring my cup", "--memory", bank, "--out", tmp_path, "--box", line[1][1]
     )
     assert done.returncode == 0, done.stderr
     assert "the only candidate" in done.stdout

@@ -342,11 +342,11 @@ def put(path: Path, **new: object) -> None:
         (lambda f: cut(f / "meta/episodes/chunk-000/file-000.parquet"), "is damaged .ArrowInvalid"),
         (
             lambda f: cut(f / "videos/observation.images.front/chunk-000/file-000.mp4"),
-            "is damaged .InvalidDataError",
+            "is damaged .BadPhoto",
         ),
         (
             lambda f: (f / "videos/observation.images.front/chunk-000/file-000.mp4").unlink(),
-            "is damaged .FileNotFoundError",
+            "is damaged .BadPhoto",
         ),
         (lambda f: (f / "data/chunk-000/file-000.parquet").unlink(), "is damaged"),
         (lambda f: (f / ABOUT).write_text("{"), "absent or damaged .JSONDecodeError"),

@@ -16,6 +16,7 @@ from tests.command import vap
 from vap_core.attend import Attender
 from vap_core.base.errors import BadOutput, UnknownName
 from vap_core.policies.protocol import PolicyInput
+from vap_core.prompt import PALETTE
 from vap_core.recording import Recorder, read_summary, recording_name
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.prompters import TintPrompter
@@ -124,7 +125,8 @@ def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
     row = replace(STUDY.rows(SUITE, TASK)[0], max_steps=2)
     (episode,) = rollout(replace(trial, policy=Witness()), [row], keep_images=True)
     frame = episode.frames[0]
-    assert seen[0].text == episode.header.rewritten == f"pick up the red {row.category}"
+    (word,) = {c.name for c in PALETTE} & set(seen[0].text.split())
+    assert seen[0].text == episode.header.rewritten == f"pick up the {word} {row.category}"
     assert np.array_equal(seen[0].images["front"], frame.prompted["front"])
     assert np.shares_memory(seen[0].images["front"], frame.prompted["front"])
     changed = (frame.images["front"] != frame.prompted["front"]).any(axis=2)

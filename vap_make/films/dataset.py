@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from vap_core.base.errors import BadOutput
+from vap_core.base.errors import BadOutput, BadPhoto
 from vap_core.base.files import code_version, parse_json, read_file, write_atomic, writing
 from vap_core.simulation import robots
 from vap_core.simulation.suites import Suite, suite
@@ -237,7 +237,7 @@ def read(folder: Path, keep: Callable[[int], bool] = lambda stage: True) -> list
     try:
         known = suite(card["suite"])
         return list(_films(known, folder, card["episodes"], keep))
-    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
+    except (BadPhoto, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         # ArrowException and FFmpegError are among them.
         raise BadOutput(f"read: {folder} is damaged ({_line(error)}); {AGAIN}.") from error
 
