@@ -120,7 +120,7 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (
         1,
-        "bring the red cup",
+        "bring the blue cup",
         5,
     )
     assert np.array(answer["similarity"]).shape == (3, 5)
