@@ -260,6 +260,11 @@ and 60 elect 61."""
 SAME_OBJECT_IOU = 0.6
 """Of proposals that overlap by more, the best stays. In 198 views it changes no winner, and leaves
 29 crops of 40 in an unfamiliar view and 8 of 9 in a familiar one."""
+TILED_PX = 1_000_000
+"""From so many pixels on an unfamiliar view is looked at in tiles, too. Of 60 packages pasted into
+photos of 1920 x 1080, 4 to 13 % of the width, 52 are among the 40 boxes, without tiles 50."""
+CUT_PX = 2
+"""A box that comes this near to a tile's edge inside the picture is cut by it."""
 REFERENCE_SHARE = 0.95
 """A reference's object may fill the photo."""
 AGREEMENT = 0.05
@@ -267,6 +272,14 @@ AGREEMENT_IOU = 0.5
 """What a proposal gains in units of cosine where a box of the phrase head agrees with it."""
 OBJECTNESS = 0.05
 """What a proposal gains for every natural logarithm of its score."""
+
+
+def tiles_of(image: Rgb) -> list[tuple[int, int, int, int]]:
+    """Nine tiles, x0 y0 x1 y1, each half as long as the picture, so that they overlap by half."""
+    height, width = image.shape[:2]
+    tall, wide = -(-height // 2), -(-width // 2)
+    tops, lefts = (0, (height - tall) // 2, height - tall), (0, (width - wide) // 2, width - wide)
+    return [(x, y, x + wide, y + tall) for y in tops for x in lefts]
 
 
 class OpenDetector:
@@ -290,8 +303,12 @@ class OpenDetector:
             named = self._named(image, phrase)
             familiar = _is_familiar(named)
             most = MOST if familiar else MOST_UNFAMILIAR
-            xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
-            alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=len(xyxy))
+            corners = [(0, 0, image.shape[1], image.shape[0])]
+            if not familiar and image.shape[0] * image.shape[1] >= TILED_PX:
+                corners += tiles_of(image)
+            parts = [self._propose_in(image, corner, threshold, most) for corner in corners]
+            xyxy, score = (np.concatenate(part) for part in zip(*parts, strict=True))
+            alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=most)
             xyxy, score = xyxy[alone], score[alone]
             if familiar:
                 kept = agreed(xyxy, named)
@@ -300,6 +317,18 @@ class OpenDetector:
             evidence = prior(xyxy, score, named)
             found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
         return found
+
+    def _propose_in(
+        self, image: Rgb, corner: tuple[int, int, int, int], threshold: float, most: int
+    ) -> Found:
+        """What is proposed in a tile, in the picture's pixels, but for what the tile cuts."""
+        x0, y0, x1, y1 = corner
+        xyxy, score = self.propose(image[y0:y1, x0:x1], threshold, most, LARGEST_SHARE)
+        xyxy = xyxy + np.array([x0, y0, x0, y0], np.float32)
+        sides = np.array([x0, y0, -x1, -y1])
+        inside = sides > np.array([0, 0, -image.shape[1], -image.shape[0]])
+        cut = inside & (xyxy * (1, 1, -1, -1) <= sides + CUT_PX)
+        return xyxy[~cut.any(axis=1)], score[~cut.any(axis=1)]
 
     def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
         """Boxes of any size, with their priors.
