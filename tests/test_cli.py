@@ -139,13 +139,13 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
     assert not again.stderr
     implicit = ("bring the one I used last", "--parser", "embedding", "--memory", bank)
     done = vap("ground", image, *implicit, "--out", tmp_path, *hand)
-    assert "instruction: bring the red cup" in done.stdout, done.stderr
+    assert "instruction: bring the blue cup" in done.stdout, done.stderr
     down = ("bring my cup", "--parser", "http://127.0.0.1:9/v1", "--memory", bank)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENAI_MODEL", "reader-1")
         assert "is the server up" in refused("ground", image, *down, "--out", tmp_path, *hand)
         done = vap("ground", image, *down, "--fall-back", "--out", tmp_path, *hand)
-    assert "instruction: bring the red cup" in done.stdout
+    assert "instruction: bring the blue cup" in done.stdout
     assert "The rule parses instead." in done.stderr
     assert len(read_uses(bank)) >= 3
     assert {use.object for use in read_uses(bank)} == {"mug"}
@@ -170,7 +170,7 @@ def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     assert "mug: not in view, likeness" in text
     assert "--always-tint" in text
     answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
-    assert answer["instruction"] == "bring the red cup"
+    assert answer["instruction"] == "bring the blue cup"
     assert (answer["threshold"], answer["rejected"]) == (None, None)
 
 

@@ -8,11 +8,12 @@ in CenterNet and FCOS). The head was trained on rendered tabletop scenes alone.
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.boxes import box_iou, suppress_overlaps
@@ -264,7 +265,7 @@ TILED_PX = 1_000_000
 """From so many pixels on an unfamiliar view is looked at in tiles, too. Of 60 packages pasted into
 photos of 1920 x 1080, 4 to 13 % of the width, 52 are among the 40 boxes, without tiles 50."""
 CUT_PX = 2
-"""A box that comes this near to a tile's edge inside the picture is cut by it."""
+"""A box that comes this near to a tile's edge may be cut by it."""
 REFERENCE_SHARE = 0.95
 """A reference's object may fill the photo."""
 AGREEMENT = 0.05
@@ -274,12 +275,16 @@ OBJECTNESS = 0.05
 """What a proposal gains for every natural logarithm of its score."""
 
 
-def tiles_of(image: Rgb) -> list[tuple[int, int, int, int]]:
-    """Nine tiles, x0 y0 x1 y1, each half as long as the picture, so that they overlap by half."""
-    height, width = image.shape[:2]
-    tall, wide = -(-height // 2), -(-width // 2)
-    tops, lefts = (0, (height - tall) // 2, height - tall), (0, (width - wide) // 2, width - wide)
-    return [(x, y, x + wide, y + tall) for y in tops for x in lefts]
+def half_of(image: Rgb) -> Int64[np.ndarray, "2"]:
+    """Width and height of a tile: half the picture's, rounded up."""
+    return -(-np.array(image.shape[1::-1]) // 2)
+
+
+def tiles_of(image: Rgb) -> list[tuple[int, int]]:
+    """The near corners of nine tiles that overlap by half."""
+    size = np.array(image.shape[1::-1])
+    steps = np.linspace(0, size - half_of(image), 3).astype(int).T.tolist()
+    return list(product(*steps))
 
 
 class OpenDetector:
@@ -303,10 +308,9 @@ class OpenDetector:
             named = self._named(image, phrase)
             familiar = _is_familiar(named)
             most = MOST if familiar else MOST_UNFAMILIAR
-            corners = [(0, 0, image.shape[1], image.shape[0])]
-            if not familiar and image.shape[0] * image.shape[1] >= TILED_PX:
-                corners += tiles_of(image)
-            parts = [self._propose_in(image, corner, threshold, most) for corner in corners]
+            parts = [self.propose(image, threshold, most, LARGEST_SHARE)]
+            if not familiar and image[..., 0].size >= TILED_PX:
+                parts += [self._in_tile(image, near, threshold, most) for near in tiles_of(image)]
             xyxy, score = (np.concatenate(part) for part in zip(*parts, strict=True))
             alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=most)
             xyxy, score = xyxy[alone], score[alone]
@@ -318,17 +322,14 @@ class OpenDetector:
             found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
         return found
 
-    def _propose_in(
-        self, image: Rgb, corner: tuple[int, int, int, int], threshold: float, most: int
-    ) -> Found:
-        """What is proposed in a tile, in the picture's pixels, but for what the tile cuts."""
-        x0, y0, x1, y1 = corner
-        xyxy, score = self.propose(image[y0:y1, x0:x1], threshold, most, LARGEST_SHARE)
-        xyxy = xyxy + np.array([x0, y0, x0, y0], np.float32)
-        sides = np.array([x0, y0, -x1, -y1])
-        inside = sides > np.array([0, 0, -image.shape[1], -image.shape[0]])
-        cut = inside & (xyxy * (1, 1, -1, -1) <= sides + CUT_PX)
-        return xyxy[~cut.any(axis=1)], score[~cut.any(axis=1)]
+    def _in_tile(self, image: Rgb, near: tuple[int, int], threshold: float, most: int) -> Found:
+        """What is proposed in a tile, in the picture's pixels, but for what its edges cut."""
+        (x, y), size = near, half_of(image)
+        xyxy, score = self.propose(
+            image[y : y + size[1], x : x + size[0]], threshold, most, LARGEST_SHARE
+        )
+        whole = ((xyxy[:, :2] > CUT_PX) & (xyxy[:, 2:] < size - CUT_PX)).all(axis=1)
+        return xyxy[whole] + np.array([x, y, x, y], np.float32), score[whole]
 
     def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
         """Boxes of any size, with their priors.
