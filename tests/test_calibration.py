@@ -126,7 +126,10 @@ def test_a_finished_scene_is_not_measured_again(tmp_path, monkeypatch):
     text, chosen = run.calibrate("toy", tmp_path / "out", scenes=2, progress=False)
     assert asked == [0, 1]
     assert chosen.familiar == 0.7
-    assert "chosen: Thresholds(familiar=0.7, unfamiliar=0.7, together=None); the stack has None" in text
+    assert (
+        "chosen: Thresholds(familiar=0.7, unfamiliar=0.7, together=None); the stack has None"
+        in text
+    )
     (tmp_path / "out" / "scenes" / "00000.json").write_text("[")
     with pytest.raises(BadOutput, match="delete it"):
         run.calibrate("toy", tmp_path / "out", scenes=2, progress=False)

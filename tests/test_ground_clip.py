@@ -1,4 +1,4 @@
-"""ground on clips and on large pictures: tracks through, what is written, and tiles."""
+"""ground on clips: tracks through, and what is written."""
 
 import errno
 import json
@@ -16,8 +16,7 @@ from vap_core.base import media
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
 from vap_core.memory import remember, save
-from vap_core.perception import boxes, stacks
-from vap_core.perception.boxes import GRID, TiledDetector, tile_corners
+from vap_core.perception import stacks
 from vap_core.perception.protocols import Stack
 from vap_core.recording import show as film_pictures
 from vap_core.recording import write_film
@@ -240,67 +239,19 @@ def test_a_film_on_a_full_disk_is_one_line(tmp_path):
         pass
 
 
-def test_tiles_cover_the_picture_and_overlap_by_half():
-    corners = tile_corners(61, 100)
-    assert len(corners) == GRID**2
-    covered = np.zeros((61, 100), int)
-    for x0, y0, x1, y1 in corners:
-        assert (x1 - x0, y1 - y0) == (50, 31)
-        covered[y0:y1, x0:x1] += 1
-    assert covered.min() >= 1
-    assert covered[20, 40] == 4
-    assert covered[0, 0] == 1
-
-
-def test_tiles_find_what_the_whole_picture_is_too_coarse_for():
-    """A detector that sees nothing under a tenth of its picture's width finds it in a tile, once."""
-
-    def coarse(images, phrase, threshold=None):
-        found = []
-        for boxes, image in zip(detector(images, phrase), images, strict=True):
-            large = boxes.xyxy[:, 2] - boxes.xyxy[:, 0] >= image.shape[1] / 10
-            found.append(Boxes(boxes.xyxy[large], boxes.score[large], phrase))
-        return found
-
-    rgb = scene([(70, 30, RED), (4, 100, GREEN)], size=200, side=14)
-    assert len(coarse([rgb], "cup")[0]) == 0
-    (boxes,) = TiledDetector(coarse)([rgb], "cup")
-    assert sorted(boxes.xyxy.tolist()) == [[4, 100, 18, 114], [70, 30, 84, 44]]
-    (none,) = TiledDetector(coarse)([np.zeros((200, 200, 3), np.uint8)], "cup")
-    assert len(none) == 0
-
-
-def test_large_pictures_are_tiled_and_it_is_said(bank, tmp_path, monkeypatch):
-    monkeypatch.setattr(boxes, "SMALL_MEGAPIXELS", 0.03)
-    rgb = scene([(150, 90, RED), (30, 30, GREEN)], size=200, side=12)
-    Image.fromarray(rgb).save(tmp_path / "desk.png")
-    words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy")
-    where = ("--memory", bank, "--out", tmp_path, "--json")
-    done = vap(*words, *where)
-    assert "nine overlapping half-size tiles" in done.stderr
-    answer = json.loads(done.stdout)
-    assert answer["size"] == [200, 200]
-    assert answer["candidates"][answer["winner"]] == [150, 90, 162, 102]
-    assert "tiles" not in vap(*words, *where, "--no-tiles").stderr
-
-
-@pytest.mark.parametrize(("width", "tiled"), [(400, True), (380, False)])
-def test_a_picture_is_tiled_by_the_size_of_its_file(bank, tmp_path, monkeypatch, width, tiled):
-    """A long one is shrunk below the limit before it is looked at."""
-    monkeypatch.setattr(boxes, "SMALL_MEGAPIXELS", 0.07)
+def test_boxes_are_of_the_picture_as_it_is_shrunk(bank, tmp_path, monkeypatch):
     monkeypatch.setattr(grounding, "GROUND_SIDE", 256)
-    rgb = np.zeros((180, width, 3), np.uint8)
+    rgb = np.zeros((180, 400, 3), np.uint8)
     rgb[90:130, 200:240] = RED
     Image.fromarray(rgb).save(tmp_path / "long.png")
     words = ("ground", tmp_path / "long.png", "bring my cup", "--stack", "toy", "--memory", bank)
     done = vap(*words, "--out", tmp_path, "--json")
     assert done.returncode == 0, done.stderr
-    assert ("nine overlapping half-size tiles" in done.stderr) == tiled
-    assert json.loads(done.stdout)["size"] == [256, round(256 * 180 / width)]
+    assert "boxes are pixels of the picture at 256x115" in done.stderr
+    assert json.loads(done.stdout)["size"] == [256, 115]
 
 
 def test_boxes_by_hand_are_judged_by_the_detector_itself(bank, tmp_path, monkeypatch):
-    """With --tiles it stood behind another one, which could not tell a photo from a render."""
     asked = []
 
     class Judge:
@@ -315,7 +266,6 @@ def test_boxes_by_hand_are_judged_by_the_detector_itself(bank, tmp_path, monkeyp
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: stack)
     Image.fromarray(scene([(26, 26, RED)])).save(tmp_path / "desk.png")
     words = ("ground", tmp_path / "desk.png", "bring my cup", "--stack", "toy", "--memory", bank)
-    done = vap(*words, "--out", tmp_path, "--box", "26,26,38,38", "--tiles")
+    done = vap(*words, "--out", tmp_path, "--box", "26,26,38,38")
     assert done.returncode == 0, done.stderr
     assert asked == ["cup"]
-    assert "tiles" not in done.stderr

@@ -77,6 +77,18 @@ def check_two_of_three(trial: Trial, rows: Sequence[EpisodeRow], message: str) -
     assert re.search(message, bad.outcome.detail)
 
 
+class Odd(BaseException):
+    """What no `except Exception` sees."""
+
+
+def ends_all(states: list, chunks: list, i: int) -> object:
+    raise Odd("of a library")
+
+
+def closes(states: list, chunks: list, i: int) -> object:
+    raise GeneratorExit
+
+
 def crash(states: list, chunks: list, i: int) -> object:
     raise ValueError("the policy's own mistake")
 
@@ -86,6 +98,8 @@ def crash(states: list, chunks: list, i: int) -> object:
     [
         (crash, "ValueError: the policy's own mistake"),
         (leave, r"the policy called sys\.exit\(0\)"),
+        (ends_all, r"the policy raised Odd\('of a library'\); raise an Exception"),
+        (closes, r"the policy raised GeneratorExit\(\); raise an Exception"),
         (with_chunk(np.full((1, 7), np.nan, np.float32)), "numbers that are not finite"),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.toys import TOYS, MeanColour, overhead, personal, scene
+from tests.toys import TOYS, MeanColour, detector, overhead, personal, scene
 from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Boxes, Rgb
 from vap_core.memory import load, reference_box, register, save
@@ -25,6 +25,7 @@ from vap_core.perception.embedded.proposer import (
     OpenDetector,
     Proposer,
     decode_proposals,
+    tiles_of,
 )
 from vap_core.perception.protocols import Detector, Stack, Thresholds
 from vap_core.prompt import PALETTE, tint
@@ -246,6 +247,29 @@ def test_boxes_by_hand_are_judged_too() -> None:
             {"front": DESK}, f"bring my {phrase}", boxes={"front": boxes(CUP_BOX, BOWL_BOX)}
         )
         assert attended.groundings["front"][0].candidates.familiar == (phrase == "cup")
+
+
+class Coarse:
+    """Sees nothing under a tenth of its picture's width, and what its picture cuts as it is cut."""
+
+    def __call__(self, rgb: Rgb, *limits: float) -> tuple[np.ndarray, np.ndarray]:
+        (found,) = detector([rgb], "thing")
+        large = found.xyxy[:, 2] - found.xyxy[:, 0] >= rgb.shape[1] / 10
+        return found.xyxy[large], found.score[large]
+
+
+@pytest.mark.parametrize(("size", "phrase", "n"), [(1000, "x", 2), (990, "x", 0), (1000, "cup", 0)])
+def test_an_unfamiliar_picture_of_a_megapixel_is_looked_at_in_tiles(
+    size: int, phrase: str, n: int
+) -> None:
+    """What several tiles show, whole or cut, is one box."""
+    rgb = scene([(350, 150, TEAL), (470, 560, SAND)], size=size, side=70)
+    (found,) = OpenDetector(Coarse(), knows_cups)([rgb], phrase)
+    assert sorted(found.xyxy.tolist()) == [[350, 150, 420, 220], [470, 560, 540, 630]][:n]
+    covered = np.zeros((61, 100), int)
+    for x, y in tiles_of(rgb[:61, :100]):
+        covered[y : y + 31, x : x + 50] += 1
+    assert (covered.min(), covered[0, 0], covered[20, 40]) == (1, 1, 4)
 
 
 # --- Registering ------------------------------------------------------------------------------------------------------

@@ -161,13 +161,6 @@ def ground(
             help="A candidate x0,y0,x1,y1 in pixels, instead of the detector; repeatable."
         ),
     ] = None,
-    tiles: Annotated[
-        bool | None,
-        typer.Option(
-            help="Look for small objects in nine overlapping tiles, too; default from 3 megapixels "
-            "on."
-        ),
-    ] = None,
     always_tint: Annotated[
         bool,
         typer.Option(
@@ -205,7 +198,6 @@ def ground(
     from vap_core.base.errors import BadInstruction, command
     from vap_core.base.media import load_photo, shrink
     from vap_core.instruction.parsers import Parsing
-    from vap_core.perception.boxes import SMALL_MEGAPIXELS
     from vap_core.study.grounding import (
         GROUND_SIDE,
         ground_clip,
@@ -218,10 +210,9 @@ def ground(
 
     parsing = Parsing(parser=parser, speaker=speaker, fall_back=fall_back)
     if is_clip(image):
-        if box or as_json or tiles:
+        if box or as_json:
             raise BadInstruction(
-                "ground: --box, --tiles and --json are for single pictures; leave them out for a "
-                "clip."
+                "ground: --box and --json are for single pictures; leave them out for a clip."
             )
         summary, rrd, mp4 = ground_clip(
             image,
@@ -240,20 +231,12 @@ def ground(
         print(f"wrote {mp4} and {rrd}; look: {command('view', rrd)}")
         return
     rgb = load_photo(image, long_side=None)
-    if tiles is None:  # by the file's own size
-        tiles = rgb.shape[0] * rgb.shape[1] >= SMALL_MEGAPIXELS * 1e6
     if not box:
         rgb = shrink(rgb, GROUND_SIDE)
     boxes = parse_boxes(box, rgb) if box else None
     if max(rgb.shape[:2]) == GROUND_SIDE:
         print(
             f"note: boxes are pixels of the picture at {rgb.shape[1]}x{rgb.shape[0]}.",
-            file=sys.stderr,
-        )
-    if tiles and boxes is None:
-        print(
-            "note: looking at the whole picture and at nine overlapping half-size tiles of it, for "
-            "small objects; --no-tiles turns it off.",
             file=sys.stderr,
         )
     found = ground_image(
@@ -264,7 +247,6 @@ def ground(
         objects=object,
         boxes=boxes,
         always_tint=always_tint,
-        tiles=tiles,
         parsing=parsing,
     )
     note_uses(memory, found.used, speaker)

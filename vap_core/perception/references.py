@@ -25,8 +25,6 @@ MOST_BOXES = 12
 SCORE_WEIGHT, CENTRE_WEIGHT, AREA_WEIGHT = 0.1, 0.3, 0.02
 """Of log score, distance from the photo's centre (in its sides) and log share of its area, beside
 the cosine to the other photos."""
-PRIOR_WEIGHT = 2.0
-"""Of a box's prior, which takes the place of its score where a detector gives it."""
 ROUNDS = 4
 """How often boxes are chosen: first by all boxes of the other photos, then by the chosen ones."""
 RIVAL_IOU = 0.5
@@ -113,10 +111,10 @@ def choose_references(
         for i, part in enumerate(rows):
             others = [other for other in shown[:i] + shown[i + 1 :] if len(other)]
             cosines = [(part @ other.T).max(axis=1) for other in others]
-            ballots.append(np.array(cosines, np.float32).reshape(len(cosines), len(part)))
+            ballots.append(np.array(cosines or [np.full(len(part), np.nan)]))
         first = first or ballots
         best = [
-            0 if i in boxes_given else int(_score(prior, ballot).argmax()) if len(prior) else 0
+            0 if i in boxes_given or not prior.size else int(_score(prior, ballot).argmax())
             for i, (prior, ballot) in enumerate(zip(priors, ballots, strict=True))
         ]
         shown = [part[k : k + 1] for part, k in zip(rows, best, strict=True)]
@@ -150,13 +148,11 @@ def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) 
     xyxy = found.xyxy[:MOST_BOXES]
     score = found.score[:MOST_BOXES]
     evidence = np.log(score + np.float32(1e-3)) * np.float32(SCORE_WEIGHT)
-    if found.prior is not None:
-        evidence = np.float32(PRIOR_WEIGHT) * found.prior[:MOST_BOXES]
     if given is not None:
         xyxy = np.concatenate([given[None], xyxy])
         score = np.concatenate([np.ones(1, np.float32), score])
         evidence = np.concatenate([np.zeros(1, np.float32), evidence])
-    return Boxes(xyxy, score, category, prior=evidence.astype(np.float32))
+    return Boxes(xyxy, score, category, prior=evidence)
 
 
 def _choose(
@@ -170,14 +166,14 @@ def _choose(
     if not len(boxes):
         return _whole(photo, f"no {boxes.phrase} was found in it")
     prior = _prior(photo, boxes)
-    enough = len(ballots) + 1 >= FEWEST
+    enough = len(ballots) >= FEWEST - 1
     score = _score(prior, first)
     chosen = boxes.xyxy[best : best + 1]
-    agreement = float(ballots[:, best].mean()) if len(ballots) else float("nan")
+    agreement = float(ballots[:, best].mean())
     rivals = box_iou(chosen, boxes.xyxy)[0] < RIVAL_IOU
     apart = box_cover(chosen, boxes.xyxy)[0] < ELSEWHERE
     lead = np.where(rivals, score[best] - score, np.inf)
-    close = lead < (CLOSE if len(ballots) else CLOSE_ALONE)
+    close = lead < (CLOSE_ALONE if np.isnan(agreement) else CLOSE)
     outvoted = enough and rivals[(prior + ballots).argmax(axis=1)].mean() > 1 - AGREED
     doubt = ""
     if is_given:
@@ -197,7 +193,7 @@ def _choose(
 def _score(
     prior: Float[np.ndarray, " n"], ballots: Float[np.ndarray, "k n"]
 ) -> Float[np.ndarray, " n"]:
-    return prior + ballots.mean(axis=0) if len(ballots) else prior
+    return prior + np.nan_to_num(ballots.mean(axis=0))
 
 
 def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:

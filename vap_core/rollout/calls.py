@@ -69,6 +69,10 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
         raise TimeoutError(
             f"the policy did not answer within {limit_s:g} s; allow more with --policy-timeout."
         ) from None
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        raise RuntimeError(f"the policy raised {error!r}; raise an Exception instead.") from error
     finally:
         note.cancel()
 

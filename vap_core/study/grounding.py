@@ -6,7 +6,6 @@ The answer is the candidates, the votes, the margin and the rewritten instructio
 import os.path
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -98,24 +97,19 @@ def ground_image(
     *,
     objects: Sequence[str] | None = None,
     boxes: Boxes | None = None,
-    tiles: bool = False,
     always_tint: bool = False,
     parsing: Parsing | None = None,
 ) -> Found:
     """Run the method's first step on one picture with the remembered objects of a bank.
 
-    With `tiles` the detector also looks at nine overlapping tiles; boxes that are given are taken
-    as they are. Without `parsing` the rule parses.
+    Boxes that are given are taken as they are. Without `parsing` the rule parses.
 
     Raises: as `load_own`, `Parsing.load` and `Attender.start`; BadMemory for a memory that is
         damaged or of another encoder.
     """
-    from vap_core.perception.boxes import TiledDetector
     from vap_core.perception.stacks import load_own
 
     models = load_own(stack)
-    if tiles and boxes is None:
-        models = replace(models, detector=TiledDetector(models.detector))
     attender, bank = _attender(memory, models, parsing, always_tint)
     boxes_by_camera = None if boxes is None else {CAMERA: boxes}
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=objects, boxes=boxes_by_camera)

@@ -214,14 +214,14 @@ def leave_out_doubtful(
     good = [i for i, reference in enumerate(references) if not reference.doubt]
     lines = []
     for reference, photo in zip(references, photos, strict=True):
-        name = shlex.quote(_shortest_name(photo, photos))
-        ready = [
-            f"--box {name}={','.join(map(str, np.rint(box).astype(int)))} (box {k + 1})"
-            for k, box in enumerate(alternatives(reference))
-        ]
-        remedy = " or ".join(ready) or f"--box {name}=x0,y0,x1,y1 in pixels"
         if reference.doubt:
-            lines.append(f"{_shortest_name(photo, photos)}: {reference.doubt}; give {remedy}")
+            name = _shortest_name(photo, photos)
+            ready = [
+                f"--box {shlex.quote(name)}={','.join(f'{x:.0f}' for x in box)} (box {k})"
+                for k, box in enumerate(alternatives(reference), 1)
+            ]
+            ready = ready or [f"--box {shlex.quote(name)}=x0,y0,x1,y1 in pixels"]
+            lines.append(f"{name}: {reference.doubt}; give {' or '.join(ready)}")
     if lines and len(good) < FEWEST:
         write_sheet(sheet, references, photos)
         raise BadPhoto(f"register: {'; '.join(lines)}; or pass --accept. Look at {sheet}.")
@@ -230,10 +230,9 @@ def leave_out_doubtful(
 
 def alternatives(reference: Reference) -> list[Box]:
     """What could be meant in a doubtful photo, the chosen box first."""
-    boxes = [reference.box, reference.rival]
     if not reference.doubt or reference.chosen_by == "whole":
         return []
-    return [box for box in boxes if box is not None]
+    return [reference.box] if reference.rival is None else [reference.box, reference.rival]
 
 
 def remember_references(
@@ -262,10 +261,10 @@ def write_sheet(path: Path, references: Sequence[Reference], photos: Sequence[Pa
         shown, scale = fit(reference.photo, TILE_PX, TILE_PX)
         colour = DOUBTFUL if reference.doubt else RIGHT
         draw_box(shown, (scale * reference.box).tolist(), colour, 2)
-        for k, box in enumerate(alternatives(reference)):
-            x0, y0, *_ = corners = (scale * box).tolist()
-            draw_box(shown, corners, colour, 2)
-            cv2.putText(shown, str(k + 1), (int(x0) + 6, int(y0) + 20), 0, 0.6, colour, 2)
+        for k, box in enumerate(alternatives(reference), 1):
+            draw_box(shown, (scale * box).tolist(), colour, 2)
+            at = (scale * box[:2] + (6, 20)).astype(int).tolist()
+            cv2.putText(shown, str(k), at, 0, 0.6, colour, 2)
         crop, _ = fit(reference.crop, TILE_PX, TILE_PX)
         verdict = reference.doubt or describe_choice(reference)
         tiles.append(labelled(np.concatenate([shown, crop], axis=1), [photo.name, verdict]))

@@ -8,11 +8,12 @@ in CenterNet and FCOS). The head was trained on rendered tabletop scenes alone.
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.types import Boxes, Rgb
 from vap_core.perception.boxes import box_iou, suppress_overlaps
@@ -260,6 +261,11 @@ and 60 elect 61."""
 SAME_OBJECT_IOU = 0.6
 """Of proposals that overlap by more, the best stays. In 198 views it changes no winner, and leaves
 29 crops of 40 in an unfamiliar view and 8 of 9 in a familiar one."""
+TILED_PX = 1_000_000
+"""From so many pixels on an unfamiliar view is looked at in tiles, too. Of 60 packages pasted into
+photos of 1920 x 1080, 4 to 13 % of the width, 52 are among the 40 boxes, without tiles 50."""
+CUT_PX = 2
+"""A box that comes this near to a tile's edge may be cut by it."""
 REFERENCE_SHARE = 0.95
 """A reference's object may fill the photo."""
 AGREEMENT = 0.05
@@ -267,6 +273,18 @@ AGREEMENT_IOU = 0.5
 """What a proposal gains in units of cosine where a box of the phrase head agrees with it."""
 OBJECTNESS = 0.05
 """What a proposal gains for every natural logarithm of its score."""
+
+
+def half_of(image: Rgb) -> Int64[np.ndarray, "2"]:
+    """Width and height of a tile: half the picture's, rounded up."""
+    return -(-np.array(image.shape[1::-1]) // 2)
+
+
+def tiles_of(image: Rgb) -> list[tuple[int, int]]:
+    """The near corners of nine tiles that overlap by half."""
+    size = np.array(image.shape[1::-1])
+    steps = np.linspace(0, size - half_of(image), 3).astype(int).T.tolist()
+    return list(product(*steps))
 
 
 class OpenDetector:
@@ -290,8 +308,11 @@ class OpenDetector:
             named = self._named(image, phrase)
             familiar = _is_familiar(named)
             most = MOST if familiar else MOST_UNFAMILIAR
-            xyxy, score = self.propose(image, threshold, most, LARGEST_SHARE)
-            alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=len(xyxy))
+            parts = [self.propose(image, threshold, most, LARGEST_SHARE)]
+            if not familiar and image[..., 0].size >= TILED_PX:
+                parts += [self._in_tile(image, near, threshold, most) for near in tiles_of(image)]
+            xyxy, score = (np.concatenate(part) for part in zip(*parts, strict=True))
+            alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=most)
             xyxy, score = xyxy[alone], score[alone]
             evidence = None
             if familiar:
@@ -302,6 +323,15 @@ class OpenDetector:
                 evidence = prior(xyxy, score, named)
             found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
         return found
+
+    def _in_tile(self, image: Rgb, near: tuple[int, int], threshold: float, most: int) -> Found:
+        """What is proposed in a tile, in the picture's pixels, but for what its edges cut."""
+        (x, y), size = near, half_of(image)
+        xyxy, score = self.propose(
+            image[y : y + size[1], x : x + size[0]], threshold, most, LARGEST_SHARE
+        )
+        whole = ((xyxy[:, :2] > CUT_PX) & (xyxy[:, 2:] < size - CUT_PX)).all(axis=1)
+        return xyxy[whole] + np.array([x, y, x, y], np.float32), score[whole]
 
     def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
         """Boxes of any size, with their priors.
