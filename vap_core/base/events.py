@@ -54,8 +54,7 @@ def visibility_events(frame_index: int, before: Visible, after: Visible) -> tupl
     shown = {camera for camera, _ in after}
     for camera, j in sorted(before - after):
         without = UNMARKED if camera in shown else UNMODIFIED
-        text = f"{camera}: target {j} {LOST}{without}"
-        events.append(Event(frame_index, "WARN", text))
+        events.append(Event(frame_index, "WARN", f"{camera}: target {j} {LOST}{without}"))
     for camera, j in sorted(after - before):
         events.append(Event(frame_index, "INFO", f"{camera}: target {j} re-acquired"))
     return tuple(events)

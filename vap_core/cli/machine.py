@@ -71,11 +71,13 @@ def doctor() -> None:
 
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
-    findings = []
-    for check in (_python, _gl, _weights, _lists, _rerun):
-        findings.append(_run_check(check, needed=True))
-    for check in (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie):
-        findings.append(_run_check(check, needed=False))
+    findings = [
+        _run_check(check, needed=True) for check in (_python, _gl, _weights, _lists, _rerun)
+    ]
+    findings.extend(
+        _run_check(check, needed=False)
+        for check in (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie)
+    )
     findings.append(_viewer())
     findings += _foundation()
     findings.append(_not_in_view())

@@ -27,9 +27,7 @@ def episodes(policy: Any, where: str, batch: int) -> list[Episode]:
 def actions(of: Sequence[Episode]) -> np.ndarray:
     taken = []
     for episode in of:
-        for frame in episode.frames:
-            if frame.action is not None:
-                taken.append(frame.action)
+        taken.extend(frame.action for frame in episode.frames if frame.action is not None)
     return np.array(taken)
 
 
@@ -37,8 +35,7 @@ def states(of: Sequence[Episode]) -> np.ndarray:
     """The robot's state at every step: what the simulator made of the actions."""
     seen = []
     for episode in of:
-        for frame in episode.frames:
-            seen.append(frame.state)
+        seen.extend(frame.state for frame in episode.frames)
     return np.array(seen)
 
 

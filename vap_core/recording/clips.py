@@ -128,8 +128,7 @@ def log_clip_step(rec: rr.RecordingStream, camera: str, step: ClipStep) -> None:
         shown = step.track.mask
     mask = rr.SegmentationImage(track_image(shown), opacity=1.0)
     log_row(rec, f"{root}/mask/target", mask, at=at)
-    score = rr.Scalars([step.track.score])
-    log_row(rec, f"/vap/track_score/{camera}", score, at=at)
+    log_row(rec, f"/vap/track_score/{camera}", rr.Scalars([step.track.score]), at=at)
 
 
 class DatasetRecorder:

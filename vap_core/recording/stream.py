@@ -225,8 +225,10 @@ def log_row(
     """
     columns = []
     for archetype in archetypes:
-        for batch in archetype.as_component_batches():
-            columns.append(batch.partition([len(batch.as_arrow_array())]))
+        columns.extend(
+            batch.partition([len(batch.as_arrow_array())])
+            for batch in archetype.as_component_batches()
+        )
     rec.send_columns(entity, at, columns)
 
 

@@ -193,10 +193,11 @@ def paper_spaces() -> "pd.DataFrame":
 def report(table: "pd.DataFrame") -> str:
     """The table as text, with the paper's below it. Raises: BadOutput, as `paper.ledger`."""
     rows = [HEADER]
-    for row in table.to_dict("records"):
-        rows.append(_cells(row))
-    for row in paper_spaces().to_dict("records"):
-        rows.append(_cells({**row, "policy": f"paper: {row['policy']}"}))
+    rows.extend(_cells(row) for row in table.to_dict("records"))
+    rows.extend(
+        _cells({**row, "policy": f"paper: {row['policy']}"})
+        for row in paper_spaces().to_dict("records")
+    )
     left_out = table[table.without_direction > 0]
     note = f"{NOTE} {_compared(table)}"
     if len(left_out):
@@ -259,6 +260,5 @@ def _suites_of(policy: Path, suite: str) -> list[str]:
 def _instructions(names: Sequence[str]) -> list[str]:
     texts = []
     for name in names:
-        for task in BENCHMARKS[name].tasks:
-            texts.append(task.instruction)
+        texts.extend(task.instruction for task in BENCHMARKS[name].tasks)
     return texts

@@ -141,37 +141,6 @@ def write_provenance(png: Path, study: Study) -> None:
         ) from error
 
 
-def read_provenance(png: Path) -> dict[str, Any]:
-    """What `write_provenance` kept in a PNG; empty for any other picture."""
-    from PIL import Image
-
-    with Image.open(png) as picture:
-        text = picture.info.get(CHUNK)
-    if text is None:
-        return {}
-    return dict(json.loads(text))
-
-
-def stale(png: Path) -> str:
-    """How what a still picture shows differs from what is here now, "" where it does not.
-
-    Nothing is executed that the picture names.
-
-    Raises: BadOutput for a picture without provenance.
-    """
-    about = read_provenance(png)
-    if not about:
-        raise BadOutput(f"stale: {png} does not say what it shows; take the picture again.")
-    if about["recorder"] != recorder_digest():
-        return "the recorder shows episodes otherwise now"
-    settings = {name: value for name, value in about["study"].items() if name != EXECUTED}
-    settings["tasks"] = tuple(tuple(task) for task in settings["tasks"])
-    settings["methods"] = tuple(settings["methods"])
-    if about["configuration"] != store.digest(Study(**settings).configuration()):
-        return "weights, episode lists or objects are others now"
-    return ""
-
-
 @cache
 def recorder_digest() -> str:
     """A digest of the code that decides what a recording shows, its colours and vote included.
@@ -399,8 +368,7 @@ def list_failures(
     manifests, once = _read_once(sources)
     check_diagnosed(once)
     older = once[once["case"].isna()]  # episodes of runs that are older than the diagnosis
-    known = diagnosed(once).reset_index(drop=True)
-    all_episodes = with_corrections(_with_folders(known))
+    all_episodes = with_corrections(_with_folders(diagnosed(once).reset_index(drop=True)))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
@@ -736,8 +704,7 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
             settings[field.name] = configuration[field.name]
     settings["tasks"] = ((suite, row["task"]),)
     settings["methods"] = (row["method"],)
-    label = str(row.get("policy", ""))
-    settings["policy"] = policy_today(settings["policy"], label, suite)
+    settings["policy"] = policy_today(settings["policy"], str(row.get("policy", "")), suite)
     return replace(Study(**settings), audit=False)
 
 

@@ -157,9 +157,7 @@ def to_json(found: Found) -> dict[str, Any]:
     `instruction` is the rewritten one, `said` the given one. Boxes are pixels of a picture of
     `size`, width and height.
     """
-    targets = []
-    for grounding in found.attended.groundings[CAMERA]:
-        targets.append(_grounding_to_json(grounding))
+    targets = [_grounding_to_json(grounding) for grounding in found.attended.groundings[CAMERA]]
     return {
         **targets[0],
         "instruction": found.attended.text,

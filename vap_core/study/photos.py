@@ -330,8 +330,7 @@ def measure_scene(
         }
         row |= _ground(rgb, boxes, memory[name], attender)
         if len(boxes):
-            every = np.ones(len(own), bool)
-            for among, eligible in (("all", every), ("kind", alike)):
+            for among, eligible in (("all", np.ones(len(own), bool)), ("kind", alike)):
                 row |= _vote(among, own, eligible, candidates, memory[name], attender, rgb)
         rows.append(row)
     return rows
@@ -495,8 +494,10 @@ def single_rows(memory: Mapping[str, PersonalObject], stack: Stack) -> list[Row]
             references = list(chosen[int(rng.integers(len(chosen)))])
             left_out = np.setdiff1d(np.arange(len(own)), references)
             candidates = [own[int(rng.choice(left_out))]]
-            for rival in pairs[int(rng.integers(len(pairs)))]:
-                candidates.append(rows_of[rival][int(rng.integers(len(rows_of[rival])))])
+            candidates.extend(
+                rows_of[rival][int(rng.integers(len(rows_of[rival])))]
+                for rival in pairs[int(rng.integers(len(pairs)))]
+            )
             cosine = similarity(np.stack(candidates), own[references])
             rows.append({"object": name, "right": vote(cosine).winner == 0})
     return rows
@@ -529,8 +530,7 @@ class Pan:
     def with_twins(self, boxes: Float[np.ndarray, "n 4"]) -> Float64[np.ndarray, "m 4"]:
         """Each box of the photo, and then that of its copy."""
         twin = np.array([self.photo_width, 0.0, self.photo_width, 0.0])
-        pairs = np.stack([boxes.astype(np.float64), boxes + twin], axis=1)
-        return pairs.reshape(-1, 4)
+        return np.stack([boxes.astype(np.float64), boxes + twin], axis=1).reshape(-1, 4)
 
 
 def pan_over(rgb: Rgb) -> Pan:
@@ -609,8 +609,7 @@ def visible_share(box: Float64[np.ndarray, "4"], frame: Rgb) -> float:
     """The share of a box that lies inside of the frame."""
     height, width = frame.shape[:2]
     inside = np.clip(box, 0, (width, height, width, height))
-    sides = np.maximum(inside[2:] - inside[:2], 0)
-    return float(sides.prod() / (box[2:] - box[:2]).prod())
+    return float(np.maximum(inside[2:] - inside[:2], 0).prod() / (box[2:] - box[:2]).prod())
 
 
 def lies_on(mask: Mask | None, pair: Float64[np.ndarray, "2 4"]) -> str:

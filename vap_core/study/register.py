@@ -452,8 +452,7 @@ def leave_one_out(
     if n >= FEWEST and len(rivals):
         for k in range(n):
             others = np.delete(obj.embeddings, k, axis=0)
-            candidates = np.concatenate([obj.embeddings[k : k + 1], rivals])
-            cosine = similarity(candidates, others)
+            cosine = similarity(np.concatenate([obj.embeddings[k : k + 1], rivals]), others)
             winner = vote(cosine).winner
             assert winner is not None
             mean = cosine.mean(axis=1)

@@ -364,8 +364,7 @@ def register_personal(study: Study, bank: Path) -> None:
             obj = replace(obj, description=described.description)
         spaces = {token_space(method) for method in study.methods}
         if spaces & {"copied", "aligned"}:
-            initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
-            teach(rows, bank, initialised_from)
+            teach(rows, bank, checkpoints.config_field(study.checkpoint(suite), "vlm"))
         if "own" in spaces:
             teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
         if obj is not known.get(target):
@@ -455,8 +454,7 @@ def _policy(
     )
     if not needs_token(method):
         return policy
-    embedding = _token_embedding(study, method, row, bank)
-    return policy.with_tokens({WORD: embedding})
+    return policy.with_tokens({WORD: _token_embedding(study, method, row, bank)})
 
 
 def _token_embedding(
@@ -490,10 +488,7 @@ def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
     6.
     """
     first = rows[0]
-    listed = []
-    for row in study.rows(first.suite, first.task):
-        if row.variant == first.variant:
-            listed.append(row)
+    listed = [row for row in study.rows(first.suite, first.task) if row.variant == first.variant]
     placed = models_of(rows)
     names = [name for name in models_of([*listed, *rows]) if name in placed]
     key = (first.suite, tuple(names), first.variant, study.robots)
@@ -530,8 +525,7 @@ def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
     for variant in dict.fromkeys(row.variant for row in rows):
         numbers = [i for i, row in enumerate(rows) if row.variant == variant]
         part = [rows[i] for i in numbers]
-        for i, good in zip(numbers, _try_rows(part), strict=True):
-            succeeded[i] = good
+        succeeded.update({i: good for i, good in zip(numbers, _try_rows(part), strict=True)})
     return tuple(succeeded[i] for i in range(len(rows)))
 
 

@@ -313,8 +313,7 @@ def load_policy(
         that it scales by, does not end with exactly the file's weights, or has no temperature to
         set.
     """
-    folder = locate(checkpoint)
-    policy, preprocessor, postprocessor = build(folder, device)
+    policy, preprocessor, postprocessor = build(locate(checkpoint), device)
     if temperature is not None:
         config: Any = policy.config
         if not hasattr(config, "temperature"):

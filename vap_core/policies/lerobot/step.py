@@ -301,8 +301,7 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         raise BadPolicy(f"attach: {source} has VAP attached; give the checkpoint without it.")
     refuse_code(source)
     step._load()  # what would fail at the first picture fails here
-    entry = {"class": STEP_CLASS, "config": step.get_config()}
-    pipeline["steps"].insert(place, entry)
+    pipeline["steps"].insert(place, {"class": STEP_CLASS, "config": step.get_config()})
     made = False
     try:
         out.mkdir(parents=True)
