@@ -665,84 +665,6 @@ def read(path: Path) -> tuple[dict[str, Any], list[Arm]]:
         ) from error
 
 
-COUNTED = ("files", "code", "nodes", "functions")
-
-
-def count(folders: Sequence[Path]) -> dict[str, dict[str, int]]:
-    """Files, code lines, AST nodes and functions by folder, and their sum as "=".
-
-    Docstrings are no code and no nodes, and Load, Store and Del no nodes: formatting changes
-    nothing but the lines.
-    """
-    found: dict[str, dict[str, int]] = {}
-    for top in folders:
-        for path in sorted(top.rglob("*.py")):
-            inner = path.relative_to(top).parts
-            name = f"{top.name}/{inner[0]}" if len(inner) > 1 else top.name
-            sizes = _size(path.read_text(encoding="utf-8"))
-            for key in (name, f"= {top.name}"):
-                row = found.setdefault(key, dict.fromkeys(COUNTED, 0))
-                for column, value in sizes.items():
-                    row[column] += value
-    return found
-
-
-def _size(text: str) -> dict[str, int]:
-    import ast
-
-    tree, skipped, documented = ast.parse(text), set(), set()
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            continue
-        if ast.get_docstring(node, clean=False) is not None:
-            first = node.body[0]
-            assert isinstance(first, ast.Expr)
-            skipped |= {id(first), id(first.value)}
-            documented |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    nodes = [
-        node
-        for node in ast.walk(tree)
-        if id(node) not in skipped and not isinstance(node, ast.Load | ast.Store | ast.Del)
-    ]
-    lines = enumerate(text.splitlines(), 1)
-    code = [s for n, line in lines if (s := line.strip()) and s[0] != "#" and n not in documented]
-    functions = [n for n in nodes if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
-    return {"files": 1, "code": len(code), "nodes": len(nodes), "functions": len(functions)}
-
-
-def commands() -> dict[str, list[str]]:
-    """Every command, and its options as --help shows them."""
-    from vap_core.cli import app as whole
-
-    def leaves(command: Any, *above: str) -> Iterator[tuple[str, list[str]]]:
-        inner = getattr(command, "commands", {})
-        for name, each in inner.items():
-            yield from leaves(each, *above, name)
-        if not inner:
-            options = [p.opts[0] for p in command.params if p.param_type_name == "option"]
-            yield " ".join(above), options
-
-    return dict(leaves(typer.main.get_command(whole)))
-
-
-def size() -> str:
-    """How much there is to read: counts of vap_core and vap_make by folder, options, commands."""
-    from vap_core.study.table import printed
-
-    root = Path(__file__).resolve().parents[2]
-    found = count([root / name for name in ("vap_core", "vap_make") if (root / name).is_dir()])
-    rows = [["", *COUNTED]]
-    for name, row in sorted(found.items(), key=lambda item: item[1]["nodes"]):
-        rows.append([name, *(f"{row[column]:,}" for column in COUNTED)])
-    listed = commands()
-    top = {name.split()[0] for name in listed}
-    options = sum(map(len, listed.values()))
-    return (
-        f"{printed(rows)}\n\n{len(top)} commands at the top, {len(listed)} in all, "
-        f"{options} options"
-    )
-
-
 BENCHES: dict[str, Callable[..., list[Arm]]] = {
     "step": step,
     "profile": profile,
@@ -761,7 +683,7 @@ def bench(
             help="step: the prompted control loop, a recording, a query; profile: a control step "
             "of eval by part; scale: cost against cameras, image size, candidates, batch, workers "
             "and Ray; eval: our loop against lerobot's own; stack: a stack's models; policy: the "
-            "shipped policies; size: how much code there is."
+            "shipped policies."
         ),
     ] = "step",
     stack: StackName = "foundation",
@@ -786,15 +708,11 @@ def bench(
     Example: python -m vap_core bench step
     Example: python -m vap_core bench profile --json profile.json
     Example: python -m vap_core bench stack --stack foundation-small:detector=sam3
-    Example: python -m vap_core bench size
     """
     from vap_core.base.errors import one_of
 
-    if what == "size":
-        print(size())
-        return
     if what not in BENCHES:
-        raise one_of("bench:", what, [*BENCHES, "size"])
+        raise one_of("bench:", what, BENCHES)
     more: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ended:
         if what == "stack":

@@ -389,8 +389,9 @@ def run(
                     file=sys.stderr,
                 )
 
-            more: dict[str, Any] = dict(retries=retries, alone=alone, note=note)
-            work_off(missing, run_job, keep, executor, workers, **more)
+            work_off(
+                missing, run_job, keep, executor, workers, retries=retries, alone=alone, note=note
+            )
         store.compact(folder)
     table = store.read(folder)
     errors = table[table["outcome"] == "error"]

@@ -449,15 +449,15 @@ def warnings(
     obj: PersonalObject, references: Sequence[Reference], names: Sequence[str]
 ) -> list[str]:
     """What is wrong with references that are used all the same, one line each."""
-    shapes = [reference.crop.shape for reference in references]
+    shapes = [reference.crop.shape[:2] for reference in references]
     lines = [
         f"{name}: the object is only {width}x{height} pixels; go nearer, or take more pixels"
-        for name, (height, width, _) in zip(names, shapes, strict=True)
+        for name, (height, width) in zip(names, shapes, strict=True)
         if min(height, width) < SMALL_PX
     ]
     cosine = obj.embeddings @ obj.embeddings.T
     to_others = (cosine.sum(axis=1) - cosine.diagonal()) / max(len(cosine) - 1, 1)
-    for name, mean in zip(names, to_others.tolist(), strict=True):
+    for name, mean in zip(names, to_others.tolist(), strict=False):
         if len(cosine) > 1 and mean < LEAST_COSINE:
             lines.append(
                 f"{name}: unlike the other references (mean cosine {mean:.2f}); is it the same "
