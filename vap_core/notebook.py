@@ -185,7 +185,7 @@ def census(lists: Mapping[str, Sequence[EpisodeRow]]) -> "pd.DataFrame":
     lines = []
     for (name, _, split), rows in tracks.items():
         suite, row = BENCHMARKS[name], rows[0]
-        line: dict[str, Any] = {"suite": name, "robot": suite.robot, "cameras": len(suite.cameras)}
+        line = {"suite": name, "robot": suite.robot, "cameras": len(suite.cameras)}
         line |= {"Hz": suite.hz, "instruction": row.instruction, "rule": row.rule}
         line |= {"steps": row.max_steps, "track": split or "-"}
         looks = len({row.variant for row in rows})
@@ -597,7 +597,7 @@ class Control:
         self._words = words
 
     def _repr_mimebundle_(self, **options: Any) -> dict[str, Any]:
-        data: dict[str, Any] = dict(self.box._repr_mimebundle_(**options))
+        data = dict(self.box._repr_mimebundle_(**options))
         html = f"<p><em>{escape(self._words)}</em></p>"
         return {**data, "text/plain": self._words, "text/html": html}
 

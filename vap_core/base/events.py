@@ -122,9 +122,7 @@ def _elected(grounding: Grounding, chosen_by: str, without: str) -> Event:
         text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {without}"
         return Event(0, "WARN", text)
     # Whether the candidate is the named object is not known here, so the text does not say it.
-    verb = "elects"
-    if grounding.overruled:
-        verb = "takes"
+    verb = "takes" if grounding.overruled else "elects"
     text = f"{camera}: {verb} candidate {grounding.winner} for {name} with "
     text += f"{ballot.votes[grounding.winner]}/{k} votes"
     if grounding.overruled:

@@ -374,7 +374,7 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
         out, n = Path(tempfile.mkdtemp(dir=folder)), int(name[0])
         engine.run(study, out, workers=n, record="none", progress=False, executor=executor)
 
-    ways: dict[str, Any] = {"1": workers.results, "2": workers.results}
+    ways = {"1": workers.results, "2": workers.results}
     if find_spec("ray") is not None and not quick:
         ways["2, Ray"] = workers.ray_executor(local_cluster(2))
     for name, executor in ways.items():
@@ -531,7 +531,7 @@ class LoopProcess:
             self._process.communicate()
             said = self._errors.read_text().strip().splitlines() or ["it said nothing"]
             raise BadStudy(f"bench eval: lerobot's loop of {self.code} ended: {said[-1][:160]}")
-        answer: Cost = json.loads(line)
+        answer = json.loads(line)
         return answer
 
 

@@ -203,7 +203,7 @@ class Observer:
         maps = {name: np.stack([of[c] for c in areas]) for name, of in found.items()}
         regions = {name: np.stack([a[name] for a in areas.values()]) for name in REGIONS}
         for name, heat in maps.items():
-            row: dict[str, Any] = {"step": frame.frame_index, "measure": name}
+            row = {"step": frame.frame_index, "measure": name}
             for region, area in regions.items():
                 row[f"share_{region}"] = float((heat * area).sum() / max(float(heat.sum()), 1e-12))
                 row[f"chance_{region}"] = float(area.mean())

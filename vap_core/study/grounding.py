@@ -31,6 +31,7 @@ from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import load_own
+from vap_core.study.cases import true_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -276,9 +277,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box
         cosine = grounding.similarity[i].mean()
-        points = ""
-        if candidates.verified is not None:
-            points = f"  points {candidates.verified[i]}"
+        points = f"  points {candidates.verified[i]}" if candidates.verified is not None else ""
         lines.append(
             f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
             f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}{points}"
@@ -476,7 +475,9 @@ def _follow(
             visible.append(track.mask is not None)
             recorder.add(ClipStep(number, number / hz, rgb, prompted, track))
             film.add(prompted)
-    lost = () if grounded is None else _spans(visible, grounded)
+    first_seen = len(visible) if grounded is None else grounded
+    absent = true_runs([number >= first_seen and not seen for number, seen in enumerate(visible)])
+    lost = tuple((start, stop - 1) for start, stop in absent)
     return ClipSummary(len(visible), grounded, sum(visible), lost, text, obj.name, notes)
 
 
@@ -504,16 +505,3 @@ def _of_one_size(photos: Sequence[Path]) -> Iterator[Rgb]:
                 "frames have one size. Name single pictures one by one."
             )
         yield rgb
-
-
-def _spans(visible: Sequence[bool], grounded: int) -> tuple[tuple[int, int], ...]:
-    """First and last frame of every stretch without the object, once it was grounded."""
-    spans: list[tuple[int, int]] = []
-    for number in range(grounded, len(visible)):
-        if visible[number]:
-            continue
-        if spans and spans[-1][1] == number - 1:
-            spans[-1] = (spans[-1][0], number)
-        else:
-            spans.append((number, number))
-    return tuple(spans)

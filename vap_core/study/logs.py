@@ -98,10 +98,11 @@ def _truths(row: Mapping[str, Any]) -> list[Truth]:
 
 def write_audit(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the calls of some finished episodes to a run. Raises: BadOutput."""
-    lines = []
-    for episode in episodes:
-        key = dict(zip(KEY, episode.key, strict=True))
-        lines.extend({**key, **asdict(call), "sound": call.sound} for call in episode.consumed)
+    lines = [
+        {**dict(zip(KEY, episode.key, strict=True)), **asdict(call), "sound": call.sound}
+        for episode in episodes
+        for call in episode.consumed
+    ]
     if lines:
         write_part(folder, "audit", lines, caller="audit")
 

@@ -65,7 +65,7 @@ class Paraphrase:
 @cache
 def read_vocabulary() -> dict[str, Any]:
     """The suites' objects, what they are for and look like, and other things."""
-    vocabulary: dict[str, Any] = json.loads((FOLDER / "objects.json").read_text("utf-8"))
+    vocabulary = json.loads((FOLDER / "objects.json").read_text("utf-8"))
     return vocabulary
 
 

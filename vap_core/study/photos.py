@@ -333,7 +333,7 @@ def measure_scene(
             continue
         category = photo_set.categories[name]
         own, alike = owners == name, kinds == category
-        row: Row = {
+        row = {
             "scene": scene.name,
             "object": name,
             "category": category,
@@ -392,7 +392,7 @@ def _ground(
     (grounding,) = attended.groundings[CAMERA]
     candidates, chosen = grounding.candidates, grounding.chosen
     overlap = box_iou(candidates.xyxy, boxes).max(axis=1, initial=0.0)
-    elected: Row = dict.fromkeys((*BOX, "cosine", "likeness", "chosen_iou", "margin", "verified"))
+    elected = dict.fromkeys((*BOX, "cosine", "likeness", "chosen_iou", "margin", "verified"))
     if chosen is not None:
         verified = candidates.verified
         elected = {

@@ -182,7 +182,7 @@ def summary(
     groups = rows.groupby([*by], sort=False, observed=True) if by else [((), rows)]
     lines = []
     for key, part in groups:
-        line: dict[str, Any] = {**dict(zip(by, key, strict=True)), "n": len(part)}
+        line = {**dict(zip(by, key, strict=True)), "n": len(part)}
         for name in share:
             line[name] = share_by(part, name, cluster) if cluster else _share(part[name])
         for name in mean:

@@ -101,7 +101,7 @@ class Tokens(Measurement):
     caller: ClassVar[str] = "measure tokens"
 
     def __post_init__(self) -> None:
-        known: dict[str, Any] = {"place": PLACES, "suite": suites.BENCHMARKS}
+        known = {"place": PLACES, "suite": suites.BENCHMARKS}
         for what, named in (("place", self.places), ("suite", self.suites)):
             for name in named:
                 if name not in known[what]:

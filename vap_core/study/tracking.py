@@ -176,14 +176,14 @@ def track_film(film: Film, job: Job, stack: Stack) -> list[TableRow]:
     if not names:
         return []
     states = _start_tracker(film.frames[0], names, stack)
-    before: list[Any] | None = None
+    before: list[Any] = []
     undisturbed = _TrackerRun(stack, names, job, hidden=0)
     for t, frame in enumerate(film.frames[1:], start=1):
         if t == film.start and job.hidden:
             before = copy.deepcopy(states)
         states = undisturbed.add(states, frame)
     rows = undisturbed.rows()
-    for n in job.hidden if before is not None else ():
+    for n in job.hidden if before else ():
         shown_again = film.frames[film.start + n :][:AFTER]
         if shown_again:  # else the episode was over before
             disturbed, states = _TrackerRun(stack, names, job, hidden=n), copy.deepcopy(before)

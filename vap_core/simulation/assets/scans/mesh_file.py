@@ -206,7 +206,7 @@ def _colour_obj(path: Path, parts: "list[trimesh.Trimesh]") -> None:
 def _check_ply_colours(path: Path, mesh: "trimesh.Trimesh") -> None:
     """Raises: BadObject for several textures, of which trimesh takes one, and for colours in floats
     that are no shares, which it cuts off."""
-    raw: Any = mesh.metadata.get("_ply_raw", {})
+    raw = mesh.metadata.get("_ply_raw", {})
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES).partition(b"end_header")[0]
     if raw and head.count(b"TextureFile") > 1:
@@ -336,7 +336,7 @@ def _texture_picture(visual: Any) -> Rgb | None:
 
     A texture of 2 x 2 pixels only stands in for a missing file and does not count.
     """
-    material: Any = getattr(visual, "material", None)
+    material = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or getattr(visual, "uv", None) is None or max(image.size) <= 2:
         return None
