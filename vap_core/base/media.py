@@ -406,11 +406,12 @@ def decode_video(packets: Sequence[np.ndarray], codec: str, name: str) -> list[R
 
     context: Any = av.CodecContext.create(codec, "r")
     context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
-    pictures = []
     try:
-        for data in [*packets, None]:
-            packet = None if data is None else av.Packet(data.tobytes())
-            pictures.extend(frame.to_ndarray(format="rgb24") for frame in context.decode(packet))
+        pictures = [
+            frame.to_ndarray(format="rgb24")
+            for packet in [*(av.Packet(data.tobytes()) for data in packets), None]
+            for frame in context.decode(packet)
+        ]
     except (av.FFmpegError, ValueError) as error:
         raise BadPhoto(
             f"{name} holds a video that cannot be decoded ({error!s:.120}; at most "

@@ -150,7 +150,9 @@ def wrong_prompt(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
         true_runs(wrong), key=lambda run: run[1] - run[0] if whole else run[1] == len(wrong)
     )
     kinds = [verdict for _, verdict in judged[start:stop]]
-    case: Case = "case 2" if 2 * kinds.count("case 2") >= len(kinds) else "case 1"
+    case: Literal["case 1", "case 2"] = (
+        "case 2" if 2 * kinds.count("case 2") >= len(kinds) else "case 1"
+    )
     at, _ = judged[start + kinds.index(case)]
     step = trace.steps[at]
     labels = _labels(trace.coverage[at], thresholds)

@@ -114,7 +114,7 @@ def unknown_words_notes(study: Study) -> list[str]:
 
 def worker_modules(policy: str) -> tuple[str, ...]:
     """What a worker of a study with this policy imports first."""
-    modules: tuple[str, ...] = [
+    modules = [
         "vap_core.study.engine",
         "vap_core.rollout.loop",
         "vap_core.recording.recorder",
