@@ -651,20 +651,6 @@ def write(path: Path, bench: str, about: dict[str, Any], arms: Sequence[Arm]) ->
         write_atomic(path, f"{text}\n".encode())
 
 
-def read(path: Path) -> tuple[dict[str, Any], list[Arm]]:
-    """The provenance and the arms of a measurement. Raises: BadOutput."""
-    from vap_core.base.errors import BadOutput
-
-    try:
-        found = json.loads(path.read_text())
-        return found["provenance"], [Arm(work=lambda: None, **arm) for arm in found["arms"]]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise BadOutput(
-            f"bench: {path} holds no measurement ({type(error).__name__}); bench writes one by "
-            "--json."
-        ) from error
-
-
 BENCHES: dict[str, Callable[..., list[Arm]]] = {
     "step": step,
     "profile": profile,
