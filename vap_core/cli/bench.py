@@ -622,22 +622,14 @@ def provenance(**about: Any) -> dict[str, Any]:
     for name in ("torch", "mujoco", "lerobot", "onnxruntime", "ray"):
         with suppress(PackageNotFoundError):
             libraries[name] = version(name)
-    cpus = [line for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
-    processor = cpus[0].partition(":")[2].strip() if cpus else platform.machine()
+    processor = platform.machine()
+    with suppress(OSError):
+        named = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+        processor = named[1] if named else processor
     machine = f"{processor}, {len(os.sched_getaffinity(0))} cores"
     day = datetime.now(UTC).date().isoformat()
-    return {
-        "commit": code_version(),
-        "machine": machine,
-        "day": day,
-        "libraries": libraries,
-    } | about
-
-
-def _lines(path: str) -> list[str]:
-    with suppress(OSError):
-        return Path(path).read_text().splitlines()
-    return []
+    found = dict(commit=code_version(), machine=machine, day=day, libraries=libraries)
+    return found | about
 
 
 def write(path: Path, bench: str, about: dict[str, Any], arms: Sequence[Arm]) -> None:

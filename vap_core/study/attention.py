@@ -370,13 +370,8 @@ def run_job(job: Job) -> dict[str, Rows]:
         # An episode that ended in an error before its first call has no observer.
         observer = observers.get(key) or Observer(episode.header, policy)
         row, outcome = episode.header.row, episode.outcome
-        about = {
-            "suite": row.suite,
-            "task": row.task,
-            "method": episode.header.method,
-            "seed": row.seed,
-            "episode": row.episode,
-        }
+        about = {name: getattr(row, name) for name in ("suite", "task", "seed", "episode")}
+        about["method"] = job.method
         step, touched = observer.first_touch or (None, NOTHING)
         ending = {
             "policy": episode.header.policy,
