@@ -172,7 +172,7 @@ def test_ground_says_not_in_view_unless_it_is_to_tint_always(
     assert "mug: not in view, likeness" in text
     assert "--always-tint" in text
     answer = json.loads(vap("ground", turned, *told, "--always-tint", "--json").stdout)
-    assert answer["instruction"] == "bring the blue cup"
+    assert answer["instruction"] == "bring the red cup"
     assert (answer["threshold"], answer["rejected"]) == (None, None)
 
 

@@ -28,7 +28,7 @@ from vap_core.perception.stacks import STACKS
 from vap_core.policies.lerobot.datasets import open_dataset
 from vap_core.recording import read_summary
 from vap_core.study import dataset
-from vap_core.study.dataset import _stretches, inspect_dataset, report_table
+from vap_core.study.dataset import inspect_dataset, report_table
 
 BLUE, GREEN = (0, 0, 255), (0, 255, 0)
 CAMERAS = ("top", "wrist")
@@ -402,10 +402,6 @@ def test_two_features_of_one_camera_are_refused(tmp_path: Path) -> None:
     said = r"twice has pictures .*images\.front and observation\.front, .*'front' here; remove one"
     with pytest.raises(BadDataset, match=said):
         open_dataset(tmp_path / "twice")
-
-
-def test_stretches() -> None:
-    assert _stretches([True, False, False, True, False]) == [2, 1]
 
 
 def test_the_command(recorded: Path, bank: Path, tmp_path: Path) -> None:

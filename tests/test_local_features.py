@@ -111,7 +111,7 @@ def counts_red(crops, references):
 def both(images, phrase, threshold=None):
     xyxy = np.array([[10, 10, 90, 90], [110, 10, 190, 90]], np.float32)
     score = np.ones(2, np.float32)
-    return [Boxes(xyxy, score, phrase, prior=np.zeros(2, np.float32), familiar=False)]
+    return [Boxes(xyxy, score, phrase, familiar=False)]
 
 
 def attended(**parts):

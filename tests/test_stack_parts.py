@@ -152,11 +152,13 @@ def test_a_detector_that_crops_references_still_does(embedded: Stack, photo: Rgb
         ) -> list[Boxes]:
             return left_half(images, phrase, threshold)
 
-        def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
-            return left_half([photo], f"reference {phrase}")[0]
+        def reference_boxes(
+            self, photo: Rgb, phrase: str, threshold: float
+        ) -> tuple[Boxes, np.ndarray]:
+            return left_half([photo], f"reference {phrase}")[0], np.ones(1, np.float32)
 
     detector = embedded.with_parts("mine", detector=Cropper()).detector
     assert isinstance(detector, ReferenceCropper)
-    assert detector.reference_boxes(photo, "cup", 0.1).phrase == "reference cup"
+    assert detector.reference_boxes(photo, "cup", 0.1)[0].phrase == "reference cup"
     plain = embedded.with_parts("mine", detector=left_half).detector
     assert not isinstance(plain, ReferenceCropper)

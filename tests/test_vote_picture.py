@@ -36,14 +36,14 @@ def test_a_row_for_each_candidate_a_column_for_each_photo() -> None:
     assert not framed[18 + CELL :].any(), "orange is the target's photos alone"
 
 
-@pytest.mark.parametrize("prior", [None, (-0.2, -0.1, 0.0)])
+@pytest.mark.parametrize("proof", [None, (-0.2, -0.1, 0.0)])
 def test_every_photo_votes_once_in_the_row_that_the_vote_counted(
-    prior: tuple[float, ...] | None,
+    proof: tuple[float, ...] | None,
 ) -> None:
-    """A prior may take a vote from the highest cosine."""
+    """What points prove may take a vote from the highest cosine."""
     grounding = ground(CAMERA)
-    if prior is not None:
-        boxes = replace(grounding.candidates, prior=np.array(prior, np.float32))
+    if proof is not None:
+        boxes = replace(grounding.candidates, proof=np.array(proof, np.float32))
         ballot = vote(election_scores(grounding.similarity, boxes))
         assert ballot.votes.tolist() != grounding.ballot.votes.tolist()
         winner = ballot.winner

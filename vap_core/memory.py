@@ -80,15 +80,14 @@ def reference_box(
     if not isinstance(detector, ReferenceCropper):
         (boxes,) = detector([photo], category, threshold)
         return boxes.xyxy[0] if len(boxes) else None
-    boxes = detector.reference_boxes(photo, category, threshold)
-    assert boxes.prior is not None
+    boxes, evidence = detector.reference_boxes(photo, category, threshold)
     h, w = photo.shape[:2]
     centre = np.array([w / 2, h / 2])
     inside = (boxes.xyxy[:, :2] <= centre) & (centre <= boxes.xyxy[:, 2:])
     holding = np.flatnonzero(inside.all(axis=1))
     if not len(holding):
         return None
-    return boxes.xyxy[holding[boxes.prior[holding].argmax()]]
+    return boxes.xyxy[holding[evidence[holding].argmax()]]
 
 
 def remember(name: str, category: str, crops: Sequence[Rgb], encoder: Encoder) -> PersonalObject:

@@ -185,7 +185,7 @@ def census(lists: Mapping[str, Sequence[EpisodeRow]]) -> "pd.DataFrame":
     lines = []
     for (name, _, split), rows in tracks.items():
         suite, row = BENCHMARKS[name], rows[0]
-        line: dict[str, Any] = {"suite": name, "robot": suite.robot, "cameras": len(suite.cameras)}
+        line = {"suite": name, "robot": suite.robot, "cameras": len(suite.cameras)}
         line |= {"Hz": suite.hz, "instruction": row.instruction, "rule": row.rule}
         line |= {"steps": row.max_steps, "track": split or "-"}
         looks = len({row.variant for row in rows})
@@ -255,8 +255,9 @@ def layouts_figure(
     grid = figure.subplots(1, len(lists), squeeze=False)[0]
     for axes, (name, rows) in zip(grid, lists.items(), strict=True):
         x0, y0, x1, y1 = tables_m[name]
-        look: dict[str, Any] = dict(facecolor="#f3ede4", edgecolor="#cdbfa8")
-        axes.add_patch(Rectangle((-y1, x0), y1 - y0, x1 - x0, **look))
+        axes.add_patch(
+            Rectangle((-y1, x0), y1 - y0, x1 - x0, facecolor="#f3ede4", edgecolor="#cdbfa8")
+        )
         for role in ("other objects", "look-alike", "target", "goal"):
             spots = {
                 (-place.y, place.x)
@@ -266,15 +267,17 @@ def layouts_figure(
             }
             xy = np.array(sorted(spots)).reshape(-1, 2)
             goal = role == "goal"
-            mark: dict[str, Any] = dict(
-                s=45 if goal else 8, facecolor="none" if goal else ROLES[role]
+            axes.scatter(
+                *xy.T,
+                label=role,
+                s=45 if goal else 8,
+                facecolor="none" if goal else ROLES[role],
+                edgecolor=ROLES[role],
+                linewidths=1.6 if goal else 0.0,
             )
-            edge: dict[str, Any] = dict(edgecolor=ROLES[role], linewidths=1.6 if goal else 0.0)
-            axes.scatter(*xy.T, label=role, **mark, **edge)
-        base: dict[str, Any] = dict(
-            marker="s", markersize=6, color=TEXT, linestyle="none", label="robot's base"
+        axes.plot(
+            0, 0, marker="s", markersize=6, color=TEXT, linestyle="none", label="robot's base"
         )
-        axes.plot(0, 0, **base)
         axes.set(xlim=(-0.36, 0.36), ylim=(-0.06, 0.72), aspect="equal")
         axes.set(title=f"{name}\n{len(rows)} episodes", xlabel="to the robot's right, m")
         axes.spines[["top", "right"]].set_visible(False)
@@ -594,7 +597,7 @@ class Control:
         self._words = words
 
     def _repr_mimebundle_(self, **options: Any) -> dict[str, Any]:
-        data: dict[str, Any] = dict(self.box._repr_mimebundle_(**options))
+        data = dict(self.box._repr_mimebundle_(**options))
         html = f"<p><em>{escape(self._words)}</em></p>"
         return {**data, "text/plain": self._words, "text/html": html}
 

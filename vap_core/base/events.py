@@ -54,8 +54,7 @@ def visibility_events(frame_index: int, before: Visible, after: Visible) -> tupl
     shown = {camera for camera, _ in after}
     for camera, j in sorted(before - after):
         without = UNMARKED if camera in shown else UNMODIFIED
-        text = f"{camera}: target {j} {LOST}{without}"
-        events.append(Event(frame_index, "WARN", text))
+        events.append(Event(frame_index, "WARN", f"{camera}: target {j} {LOST}{without}"))
     for camera, j in sorted(after - before):
         events.append(Event(frame_index, "INFO", f"{camera}: target {j} re-acquired"))
     return tuple(events)
@@ -123,9 +122,7 @@ def _elected(grounding: Grounding, chosen_by: str, without: str) -> Event:
         text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {without}"
         return Event(0, "WARN", text)
     # Whether the candidate is the named object is not known here, so the text does not say it.
-    verb = "elects"
-    if grounding.overruled:
-        verb = "takes"
+    verb = "takes" if grounding.overruled else "elects"
     text = f"{camera}: {verb} candidate {grounding.winner} for {name} with "
     text += f"{ballot.votes[grounding.winner]}/{k} votes"
     if grounding.overruled:

@@ -325,10 +325,11 @@ def photos_in(folder: Path) -> list[Path]:
             f"photos_in: {folder} cannot be read as a folder ({error.strerror or error}); name a "
             "folder of photos."
         ) from error
-    found = []
-    for path in paths:
-        if path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith("."):
-            found.append(path)
+    found = [
+        path
+        for path in paths
+        if path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith(".")
+    ]
     return sorted(found)
 
 
@@ -405,12 +406,12 @@ def decode_video(packets: Sequence[np.ndarray], codec: str, name: str) -> list[R
 
     context: Any = av.CodecContext.create(codec, "r")
     context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
-    pictures = []
     try:
-        for data in [*packets, None]:
-            packet = None if data is None else av.Packet(data.tobytes())
-            for frame in context.decode(packet):
-                pictures.append(frame.to_ndarray(format="rgb24"))
+        pictures = [
+            frame.to_ndarray(format="rgb24")
+            for packet in [*(av.Packet(data.tobytes()) for data in packets), None]
+            for frame in context.decode(packet)
+        ]
     except (av.FFmpegError, ValueError) as error:
         raise BadPhoto(
             f"{name} holds a video that cannot be decoded ({error!s:.120}; at most "
@@ -544,8 +545,7 @@ def _picture(frame: "av.VideoFrame", long_side: int | None) -> Rgb:
 def _sharpness(rgb: Rgb) -> float:
     import cv2
 
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    return float(cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_64F).var())
 
 
 def _best_of_each_part(sharpness: Float64[np.ndarray, " n"], count: int) -> list[int]:

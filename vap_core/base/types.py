@@ -32,9 +32,7 @@ def value[T](cls: type[T]) -> type[T]:
 class Boxes:
     """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error.
 
-    `prior` is the evidence for each box besides the references', in units of cosine, where boxes of
-    any object are proposed; None where every box is of the phrase's category. `familiar` says
-    whether the view is of the world that the stack's own models were trained on.
+    `familiar` says whether the view is of the world that the stack's own models were trained on.
 
     `verified` counts the points of each box that lie as they do on a reference, the most of any;
     `proof` is what that says, in units of cosine. Both are None where no points were compared."""
@@ -42,7 +40,6 @@ class Boxes:
     xyxy: Float32[np.ndarray, "n 4"]
     score: Float32[np.ndarray, " n"]
     phrase: str
-    prior: Float32[np.ndarray, " n"] | None = None
     familiar: bool = True
     verified: Int64[np.ndarray, " n"] | None = None
     proof: Float32[np.ndarray, " n"] | None = None
@@ -60,7 +57,6 @@ class Boxes:
             self,
             xyxy=self.xyxy[rows],
             score=self.score[rows],
-            prior=None if self.prior is None else self.prior[rows],
             verified=None if self.verified is None else self.verified[rows],
             proof=None if self.proof is None else self.proof[rows],
         )
@@ -165,7 +161,7 @@ class Ballot:
     share the most votes, where more than one does. `winner` is the elected candidate, None exactly
     when there is none to elect. `margin` is (votes of the winner - most votes of any other) / K, in
     [0, 1] when votes decide; `cosine_margin` is the same difference of mean cosines, 2 when there
-    is no other candidate. Where boxes have priors, they are added to the cosines first."""
+    is no other candidate. Where points were compared, their proof is added to the cosines first."""
 
     votes: Int64[np.ndarray, " n"]
     tied: Bool[np.ndarray, " n"]
@@ -199,9 +195,9 @@ SAME = 1e-6
 def election_scores(
     similarity: Float32[np.ndarray, "n k"], boxes: Boxes
 ) -> Float32[np.ndarray, "n k"]:
-    """What the vote compares: cosines, and where boxes have priors or proofs their sum.
+    """What the vote compares: cosines, and what points proved where they were compared.
 
-    Both count from the view's greatest sum, so no score is above its cosine.
+    That counts from the view's greatest, so no score is above its cosine.
     """
     return similarity + _evidence(boxes)[:, None]
 
@@ -212,11 +208,8 @@ def best_of_references(scores: Float32[np.ndarray, "n k"]) -> Int64[np.ndarray, 
 
 
 def _evidence(boxes: Boxes) -> Float32[np.ndarray, " n"]:
-    """Each box's prior and proof, less the greatest sum."""
-    evidence = np.zeros(len(boxes), np.float32)
-    for of_boxes in (boxes.prior, boxes.proof):
-        if of_boxes is not None:
-            evidence += of_boxes
+    """Each box's proof, less the greatest."""
+    evidence = np.zeros(len(boxes), np.float32) if boxes.proof is None else boxes.proof
     return evidence - evidence.max(initial=-np.inf)
 
 

@@ -96,8 +96,8 @@ def main() -> None:
     """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     nowhere = open(os.devnull, "w")  # noqa: SIM115  for a stream that was closed
-    out: Any = Terminal(sys.stdout or nowhere)
-    errors: Any = Terminal(sys.stderr or nowhere, "\n\t\r")
+    out = Terminal(sys.stdout or nowhere)
+    errors = Terminal(sys.stderr or nowhere, "\n\t\r")
     with nowhere, redirect_stdout(out), redirect_stderr(errors):
         _run()
 

@@ -6,6 +6,7 @@ falls on all of them; `table` compares each with the first of its axis.
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -13,8 +14,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
+from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from vap_core.rollout.loop import Trial
     from vap_core.simulation.types import EpisodeRow
     from vap_core.study.engine import Job
-    from vap_core.study.trials import Study
 
 app = typer.Typer()
 Cost = dict[str, Any]
@@ -41,17 +42,17 @@ class Arm:
 
     axis: str
     name: str
-    work: Callable[[], Cost | None]
+    work: Callable[[], object]
     n: int = 1
     facts: dict[str, Any] = field(default_factory=dict)
     costs: list[Cost] = field(default_factory=list)
 
     def repeat(self) -> None:
-        """Do it once more."""
+        """Do it once more; what it returns is its cost, if it is one."""
         wall, cpu = time.perf_counter(), time.process_time()
         cost = self.work()
-        taken = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
-        self.costs.append(cost or {**taken, "parts": {}})
+        taken = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu, "parts": {}}
+        self.costs.append(cost if isinstance(cost, dict) and "cpu" in cost else taken)
 
     def seconds(self, clock: str) -> list[float]:
         """What one of its `n` took in every repeat."""
@@ -153,18 +154,14 @@ def resolve(function: str) -> tuple[Any, str]:
     """The module or class that holds a function, and the function's name. Raises: UnknownName."""
     from vap_core.base.errors import UnknownName
 
-    module, _, path = function.partition(":")
-    *classes, name = path.split(".")
+    owner, _, name = re.split(r"([.:])(?=\w+$)", function)
     try:
-        owner: Any = import_module(module)
-        for each in classes:
-            owner = getattr(owner, each)
-        getattr(owner, name)
+        resolve_name(function)
+        return resolve_name(owner), name
     except (ImportError, AttributeError) as error:
         raise UnknownName(
             f"bench: there is no {function} ({error}); mend the parts in vap_core/cli/bench.py."
         ) from error
-    return owner, name
 
 
 @contextmanager
@@ -220,6 +217,9 @@ def step(folder: Path, quick: bool) -> list[Arm]:
         nonlocal state
         state, _ = attender.step(state, views[next(turn) % len(views)])
 
+    def ground() -> None:
+        attender.start(views[0], row.instruction, larger=larger)
+
     def record(video: bool) -> None:
         sink = DeferredRecorder(
             folder / f"{next(turn)}.rrd", episode.header, lambda _: True, video=video
@@ -228,51 +228,28 @@ def step(folder: Path, quick: bool) -> list[Arm]:
             sink.frame(frame)
         sink.close(episode.outcome)
 
-    def roll() -> Cost:
-        with profiled(ROLLOUT_PARTS) as cost:
-            list(rollout(trial, [row]))
-        return cost
-
     code = "import vap_core"
     n = max(episode.outcome.steps, 1)
-    works: list[tuple[str, str, Callable[[], object], int]] = [
-        ("a view", "backbone pass", lambda: features([noise + next(turn)], ["head"]), 1),
-        ("a view", "attend step", follow, 1),
-        (
-            "a view",
-            "grounding",
-            lambda: attender.start(views[0], row.instruction, larger=larger),
-            1,
-        ),
-        ("a control step", "rollout", roll, n),
-        ("a control step", "recording, JPEG", lambda: record(False), n),
-        ("a control step", "recording, AV1", lambda: record(True), n),
-        ("a command", "query, 20 episodes", lambda: steps.query(run, "margin < 1"), 1),
-        ("a command", code, lambda: subprocess.run([sys.executable, "-c", code], check=True), 1),
+    return [
+        Arm("a view", "backbone pass", lambda: features([noise + next(turn)], ["head"]), 1),
+        Arm("a view", "attend step", follow, 1),
+        Arm("a view", "grounding", ground, 1),
+        Arm("a control step", "rollout", lambda: rolled(trial, [row]), n),
+        Arm("a control step", "recording, JPEG", lambda: record(False), n),
+        Arm("a control step", "recording, AV1", lambda: record(True), n),
+        Arm("a command", "query, 20 episodes", lambda: steps.query(run, "margin < 1"), 1),
+        Arm("a command", code, lambda: subprocess.run([sys.executable, "-c", code], check=True), 1),
     ]
-    return [Arm(axis, name, costed(work), n) for axis, name, work, n in works]
 
 
-def costed(work: Callable[[], object]) -> Callable[[], Cost | None]:
-    """The same work; what it returns is its cost, if it is one."""
+def rolled(trial: "Trial", rows: Sequence["EpisodeRow"], batch: int = 1) -> Cost:
+    """What episodes cost by part."""
+    from vap_core.rollout.loop import rollout
 
-    def done() -> Cost | None:
-        found = work()
-        return found if isinstance(found, dict) and "cpu" in found else None
-
-    return done
-
-
-def jobs_of(study: "Study", rows: Sequence["EpisodeRow"], folder: Path) -> "list[Job]":
-    """Rows of one task in batches, as eval makes them; failures are recorded."""
-    from vap_core.study.engine import Job
-
-    found = []
-    for first in range(0, len(rows), BATCH):
-        batch = tuple(rows[first : first + BATCH])
-        keys = tuple(f"{row.task}-{row.episode}" for row in batch)
-        found.append(Job(study, study.methods[0], batch, keys, 1, folder, "failures"))
-    return found
+    with profiled(ROLLOUT_PARTS) as cost:
+        for episode in rollout(trial, rows, batch=batch):
+            assert episode.outcome.status != "error", episode.outcome.detail
+    return cost
 
 
 TASKS = {
@@ -286,7 +263,7 @@ TASKS = {
 def profile(folder: Path, quick: bool) -> list[Arm]:
     """A control step of eval by part: every suite and two methods with the shipped policies."""
     from vap_core.policies.names import MINI
-    from vap_core.study.engine import run_job, spread_evenly
+    from vap_core.study.engine import Job, run_job, spread_evenly
     from vap_core.study.trials import Study, register_personal
 
     arms = []
@@ -297,8 +274,9 @@ def profile(folder: Path, quick: bool) -> list[Arm]:
             jobs = []
             for task in study.tasks:
                 rows = spread_evenly(list(study.rows(*task)), 1 if quick else BATCH)
-                rows = [replace(row, max_steps=3 if quick else 40) for row in rows]
-                jobs += jobs_of(study, rows, folder)
+                batch = tuple(replace(row, max_steps=3 if quick else 40) for row in rows)
+                keys = tuple(f"{row.task}-{row.episode}" for row in batch)
+                jobs.append(Job(study, method, batch, keys, 1, folder, "failures"))
             arm = Arm(suite, method, lambda: None)
 
             def work(jobs: "list[Job]" = jobs, arm: Arm = arm) -> Cost:
@@ -357,7 +335,7 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
     from vap_core.policies.names import MINI
-    from vap_core.rollout.loop import Trial, rollout
+    from vap_core.rollout.loop import Trial
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.env import Env
@@ -393,29 +371,22 @@ def scale(folder: Path, quick: bool) -> list[Arm]:
                 follow="call",
                 image_size=size,
             )
-
-            def work(trial: "Trial" = trial, rows: Any = rows, batch: int = batch) -> Cost:
-                with profiled(ROLLOUT_PARTS) as cost:
-                    for episode in rollout(trial, rows, batch=batch):
-                        assert episode.outcome.status != "error", episode.outcome.detail
-                return cost
-
             name = str(next(iter(given.values())))
-            arms.append(Arm(axis, name, work, len(rows)))
+            arms.append(Arm(axis, name, partial(rolled, trial, rows, batch), len(rows)))
     tasks = tuple(("simpler-bridge", task) for task in TASKS["simpler-bridge"])
     study = Study(tasks, ("vap",), episodes=1 if quick else 10, policy=MINI, follow="call")
-    ways: dict[str, Any] = {"1": workers.results, "2": workers.results}
+
+    def spread(name: str, executor: Any) -> None:
+        out, n = Path(tempfile.mkdtemp(dir=folder)), int(name[0])
+        engine.run(study, out, workers=n, record="none", progress=False, executor=executor)
+
+    ways = {"1": workers.results, "2": workers.results}
     if find_spec("ray") is not None and not quick:
         ways["2, Ray"] = workers.ray_executor(local_cluster(2))
     for name, executor in ways.items():
-
-        def spread(name: str = name, executor: Any = executor) -> None:
-            out = Path(tempfile.mkdtemp(dir=folder))
-            engine.run(
-                study, out, workers=int(name[0]), record="none", progress=False, executor=executor
-            )
-
-        arms.append(Arm("workers (wall)", name, spread, study.episodes or 1))
+        arms.append(
+            Arm("workers (wall)", name, partial(spread, name, executor), study.episodes or 1)
+        )
     return arms
 
 
@@ -460,14 +431,13 @@ def stack(folder: Path, quick: bool, kind: str, device: str | None = None) -> li
     crops = [view[:60, :50].copy() for view in views(5)]
     tracked = views(3)
     states = parts.tracker.start(tracked, [masks] * 3)
-    works: list[tuple[str, Callable[[], object], int]] = [
-        ("detection", lambda: parts.detector(views(1), "cup"), 1),
-        ("detection, 3 views", lambda: parts.detector(views(3), "cup"), 3),
-        ("embedding, 5 crops", lambda: parts.encoder(crops), 5),
-        ("segmentation, 5 boxes", lambda: parts.segmenter(views(1)[0], boxes), 1),
-        ("track step, 5 x 3", lambda: parts.tracker.step(states, tracked), 3),
+    return [
+        Arm(kind, "detection", lambda: parts.detector(views(1), "cup"), 1),
+        Arm(kind, "detection, 3 views", lambda: parts.detector(views(3), "cup"), 3),
+        Arm(kind, "embedding, 5 crops", lambda: parts.encoder(crops), 5),
+        Arm(kind, "segmentation, 5 boxes", lambda: parts.segmenter(views(1)[0], boxes), 1),
+        Arm(kind, "track step, 5 x 3", lambda: parts.tracker.step(states, tracked), 3),
     ]
-    return [Arm(kind, name, costed(work), n) for name, work, n in works]
 
 
 def policy(folder: Path, quick: bool) -> list[Arm]:
@@ -486,10 +456,7 @@ def policy(folder: Path, quick: bool) -> list[Arm]:
         inputs = [noise_input(loaded, rng, 224) for _ in range(16)]
         states = [loaded.start(np.random.default_rng(i)) for i in range(16)]
         for n in (1, 4, 16):
-
-            def plan(n: int = n, loaded: Any = loaded, s: Any = states, i: Any = inputs) -> None:
-                loaded.plan(s[:n], i[:n])
-
+            plan = partial(loaded.plan, states[:n], inputs[:n])
             arms.append(Arm(name, f"batch {n}, an episode", plan, n))
     return arms
 
@@ -570,7 +537,7 @@ class LoopProcess:
             self._process.communicate()
             said = self._errors.read_text().strip().splitlines() or ["it said nothing"]
             raise BadStudy(f"bench eval: lerobot's loop of {self.code} ended: {said[-1][:160]}")
-        answer: Cost = json.loads(line)
+        answer = json.loads(line)
         return answer
 
 
@@ -587,7 +554,7 @@ def evaluate(folder: Path, quick: bool, earlier: Path | None, ended: ExitStack) 
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.lerobot.adapter import load_policy
     from vap_core.policies.lerobot.toy_pi0 import Toy, toy_sizes
-    from vap_core.rollout.loop import Trial, rollout
+    from vap_core.rollout.loop import Trial
     from vap_core.rollout.prompters import TintPrompter
     from vap_core.simulation import suites
     from vap_core.simulation.suites.open_row import build_scene, models_of
@@ -601,17 +568,11 @@ def evaluate(folder: Path, quick: bool, earlier: Path | None, ended: ExitStack) 
             for threads in sorted({1, os.cpu_count() or 1}):
                 given = {"n_envs": n, "in_processes": in_processes, "threads": threads}
 
-                def loop(given: Any = given, process: LoopProcess = process, n: int = n) -> Cost:
-                    return process.run(**given, videos=n == 1)
-
+                loop = partial(process.run, **given, videos=n == 1)
                 name = f"lerobot {process.code}: {n} envs, {threads} threads"
-                comes = n == 1
-                facts = {
-                    "loop": "lerobot",
-                    "code": process.code,
-                    "cpu": ("as it comes" if comes else "best") * (threads == 1 > in_processes),
-                    "wall": "as it comes" if comes else "best",
-                }
+                kind = "as it comes" if n == 1 else "best"
+                cpu = kind * (threads == 1 > in_processes)
+                facts = {"loop": "lerobot", "code": process.code, "cpu": cpu, "wall": kind}
                 name += ", each a process" * in_processes
                 arms.append(Arm("an episode", name, loop, plan.episodes, facts))
     rows = [replace(r, max_steps=plan.steps) for r in suites.rows(plan.suite, plan.task)]
@@ -629,15 +590,9 @@ def evaluate(folder: Path, quick: bool, earlier: Path | None, ended: ExitStack) 
         sensor=suite.sensor,
     )
     for name, ours in (("every step", trial), ("at calls", replace(trial, follow="call"))):
-
-        def roll(ours: "Trial" = ours) -> Cost:
-            with profiled(ROLLOUT_PARTS) as cost:
-                for episode in rollout(ours, rows, batch=4):
-                    assert episode.outcome.status != "error", episode.outcome.detail
-            return cost
-
         facts = {"loop": "ours", "code": code_version(), "cpu": name, "wall": name}
-        arms.append(Arm("an episode", f"ours, {name}", roll, plan.episodes, facts))
+        work = partial(rolled, ours, rows, 4)
+        arms.append(Arm("an episode", f"ours, {name}", work, plan.episodes, facts))
     return arms
 
 
@@ -652,16 +607,12 @@ def speed_up(arms: Sequence[Arm], clock: str, ours: str, theirs: str) -> tuple[f
     from vap_core.study.stats import ratio
 
     code = next(arm.facts["code"] for arm in arms if arm.facts["loop"] == "lerobot")
-    slow = [
-        arm.seconds(clock)
-        for arm in arms
-        if (arm.facts["loop"], arm.facts["code"], arm.facts[clock]) == ("lerobot", code, theirs)
-    ]
-    (fast,) = (
-        arm.seconds(clock)
-        for arm in arms
-        if (arm.facts["loop"], arm.facts[clock]) == ("ours", ours)
-    )
+
+    def taken(**wanted: str) -> list[list[float]]:
+        return [arm.seconds(clock) for arm in arms if wanted.items() <= arm.facts.items()]
+
+    slow = taken(loop="lerobot", code=code, **{clock: theirs})
+    (fast,) = taken(loop="ours", **{clock: ours})
     return ratio(min(slow, key=lambda seconds: float(np.median(seconds))), fast)
 
 
@@ -677,22 +628,14 @@ def provenance(**about: Any) -> dict[str, Any]:
     for name in ("torch", "mujoco", "lerobot", "onnxruntime", "ray"):
         with suppress(PackageNotFoundError):
             libraries[name] = version(name)
-    cpus = [line for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
-    processor = cpus[0].partition(":")[2].strip() if cpus else platform.machine()
+    processor = platform.machine()
+    with suppress(OSError):
+        named = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+        processor = named[1] if named else processor
     machine = f"{processor}, {len(os.sched_getaffinity(0))} cores"
     day = datetime.now(UTC).date().isoformat()
-    return {
-        "commit": code_version(),
-        "machine": machine,
-        "day": day,
-        "libraries": libraries,
-    } | about
-
-
-def _lines(path: str) -> list[str]:
-    with suppress(OSError):
-        return Path(path).read_text().splitlines()
-    return []
+    found = dict(commit=code_version(), machine=machine, day=day, libraries=libraries)
+    return found | about
 
 
 def write(path: Path, bench: str, about: dict[str, Any], arms: Sequence[Arm]) -> None:
@@ -704,98 +647,6 @@ def write(path: Path, bench: str, about: dict[str, Any], arms: Sequence[Arm]) ->
     with writing(path, "bench", "give --json another name"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, f"{text}\n".encode())
-
-
-def read(path: Path) -> tuple[dict[str, Any], list[Arm]]:
-    """The provenance and the arms of a measurement. Raises: BadOutput."""
-    from vap_core.base.errors import BadOutput
-
-    try:
-        found = json.loads(path.read_text())
-        return found["provenance"], [Arm(work=lambda: None, **arm) for arm in found["arms"]]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise BadOutput(
-            f"bench: {path} holds no measurement ({type(error).__name__}); bench writes one by "
-            "--json."
-        ) from error
-
-
-COUNTED = ("files", "code", "nodes", "functions")
-
-
-def count(folders: Sequence[Path]) -> dict[str, dict[str, int]]:
-    """Files, code lines, AST nodes and functions by folder, and their sum as "=".
-
-    Docstrings are no code and no nodes, and Load, Store and Del no nodes: formatting changes
-    nothing but the lines.
-    """
-    found: dict[str, dict[str, int]] = {}
-    for top in folders:
-        for path in sorted(top.rglob("*.py")):
-            inner = path.relative_to(top).parts
-            name = f"{top.name}/{inner[0]}" if len(inner) > 1 else top.name
-            sizes = _size(path.read_text(encoding="utf-8"))
-            for key in (name, f"= {top.name}"):
-                row = found.setdefault(key, dict.fromkeys(COUNTED, 0))
-                for column, value in sizes.items():
-                    row[column] += value
-    return found
-
-
-def _size(text: str) -> dict[str, int]:
-    import ast
-
-    tree, skipped, documented = ast.parse(text), set(), set()
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            continue
-        if ast.get_docstring(node, clean=False) is not None:
-            first = node.body[0]
-            assert isinstance(first, ast.Expr)
-            skipped |= {id(first), id(first.value)}
-            documented |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    nodes = [
-        node
-        for node in ast.walk(tree)
-        if id(node) not in skipped and not isinstance(node, ast.Load | ast.Store | ast.Del)
-    ]
-    lines = enumerate(text.splitlines(), 1)
-    code = [s for n, line in lines if (s := line.strip()) and s[0] != "#" and n not in documented]
-    functions = [n for n in nodes if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
-    return {"files": 1, "code": len(code), "nodes": len(nodes), "functions": len(functions)}
-
-
-def commands() -> dict[str, list[str]]:
-    """Every command, and its options as --help shows them."""
-    from vap_core.cli import app as whole
-
-    def leaves(command: Any, *above: str) -> Iterator[tuple[str, list[str]]]:
-        inner = getattr(command, "commands", {})
-        for name, each in inner.items():
-            yield from leaves(each, *above, name)
-        if not inner:
-            options = [p.opts[0] for p in command.params if p.param_type_name == "option"]
-            yield " ".join(above), options
-
-    return dict(leaves(typer.main.get_command(whole)))
-
-
-def size() -> str:
-    """How much there is to read: counts of vap_core and vap_make by folder, options, commands."""
-    from vap_core.study.table import printed
-
-    root = Path(__file__).resolve().parents[2]
-    found = count([root / name for name in ("vap_core", "vap_make") if (root / name).is_dir()])
-    rows = [["", *COUNTED]]
-    for name, row in sorted(found.items(), key=lambda item: item[1]["nodes"]):
-        rows.append([name, *(f"{row[column]:,}" for column in COUNTED)])
-    listed = commands()
-    top = {name.split()[0] for name in listed}
-    options = sum(map(len, listed.values()))
-    return (
-        f"{printed(rows)}\n\n{len(top)} commands at the top, {len(listed)} in all, "
-        f"{options} options"
-    )
 
 
 BENCHES: dict[str, Callable[..., list[Arm]]] = {
@@ -816,7 +667,7 @@ def bench(
             help="step: the prompted control loop, a recording, a query; profile: a control step "
             "of eval by part; scale: cost against cameras, image size, candidates, batch, workers "
             "and Ray; eval: our loop against lerobot's own; stack: a stack's models; policy: the "
-            "shipped policies; size: how much code there is."
+            "shipped policies."
         ),
     ] = "step",
     stack: StackName = "foundation",
@@ -841,15 +692,11 @@ def bench(
     Example: python -m vap_core bench step
     Example: python -m vap_core bench profile --json profile.json
     Example: python -m vap_core bench stack --stack foundation-small:detector=sam3
-    Example: python -m vap_core bench size
     """
     from vap_core.base.errors import one_of
 
-    if what == "size":
-        print(size())
-        return
     if what not in BENCHES:
-        raise one_of("bench:", what, [*BENCHES, "size"])
+        raise one_of("bench:", what, BENCHES)
     more: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ended:
         if what == "stack":
@@ -864,12 +711,8 @@ def bench(
         print(f"\n{table(arms, 'wall')}")
     if what == "eval":
         for ours in ("every step", "at calls"):
-            texts = [
-                in_brackets(speed_up(arms, "cpu", ours, how)) for how in ("as it comes", "best")
-            ]
-            print(
-                f"ours, {ours}: {texts[0]} times as fast as lerobot as it comes, "
-                f"{texts[1]} as its best"
-            )
+            found = (speed_up(arms, "cpu", ours, theirs) for theirs in ("as it comes", "best"))
+            usual, best = map(in_brackets, found)
+            print(f"ours, {ours}: {usual} times as fast as lerobot as it comes, {best} as its best")
     if keep is not None:
         write(keep, what, about, arms)

@@ -60,26 +60,18 @@ def doctor() -> None:
 
     Example: python -m vap_core doctor
     """
-    able = True
-    for finding in examine():
-        print(finding)
-        if finding.needed and not finding.works:
-            able = False
-    if not able:
+    findings = examine()
+    print(*findings, sep="\n")
+    if any(finding.needed and not finding.works for finding in findings):
         raise typer.Exit(1)
 
 
 def examine() -> list[Finding]:
     """Look at everything; nothing here raises."""
-    findings = []
-    for check in (_python, _gl, _weights, _lists, _rerun):
-        findings.append(_run_check(check, needed=True))
-    for check in (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie):
-        findings.append(_run_check(check, needed=False))
-    findings.append(_viewer())
-    findings += _foundation()
-    findings.append(_not_in_view())
-    return findings
+    needed = (_python, _gl, _weights, _lists, _rerun)
+    others = (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie)
+    checks = [_run_check(check, needed=check in needed) for check in (*needed, *others)]
+    return [*checks, _viewer(), *_foundation(), _not_in_view()]
 
 
 def _run_check(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:
@@ -142,10 +134,7 @@ def _weights() -> tuple[str, str]:
 def _lists() -> tuple[str, str]:
     from vap_core.simulation import suites
 
-    counts = []
-    for name in suites.BENCHMARKS:
-        count = len(suites.lists.read(name))
-        counts.append(f"{name} {count}")
+    counts = [f"{name} {len(suites.lists.read(name))}" for name in suites.BENCHMARKS]
     return "episode lists", ", ".join(counts)
 
 
@@ -227,14 +216,11 @@ def _foundation() -> list[Finding]:
     store = store_folder()
     findings = []
     for kind, models in KINDS.items():
-        n_missing = 0
-        for name in models:
-            if find_problem(name, store, quick=True):
-                n_missing += 1
+        missing = [name for name in models if find_problem(name, store, quick=True)]
         detail = f"{', '.join(models)} in {store}"
-        if n_missing:
-            detail = f"{n_missing} of {len(models)} models missing; {remedy(kind)}"
-        findings.append(Finding(f"stack {kind}", n_missing == 0, detail, needed=False))
+        if missing:
+            detail = f"{len(missing)} of {len(models)} models missing; {remedy(kind)}"
+        findings.append(Finding(f"stack {kind}", not missing, detail, needed=False))
     return findings
 
 

@@ -288,8 +288,7 @@ def eval_policy(
     from vap_make.policy.probe import conclude, keep, kept, probe
 
     tasks = tuple((suite, task.name) for task in suites.suite(suite).tasks)
-    study = Study(tasks, ("generic",), policy=policy)
-    checkpoint = study.checkpoint(suite)
+    checkpoint = Study(tasks, ("generic",), policy=policy).checkpoint(suite)
     if not checkpoint:
         raise BadStudy(
             f"measure policy: {policy!r} has no weights; "

@@ -291,8 +291,7 @@ def _print_notes(stack: str, warnings: Sequence[str], always_tint: bool) -> None
     """What `ground` says beside its answer."""
     from vap_core.study.grounding import missing_threshold
 
-    missing = "" if always_tint else missing_threshold(stack)
-    for line in filter(None, (missing, *warnings)):
+    for line in filter(None, ("" if always_tint else missing_threshold(stack), *warnings)):
         print(f"note: {line}", file=sys.stderr)
 
 

@@ -392,7 +392,7 @@ def study_of(asked: AskedOfAll) -> "Study":
             f"--methods: {','.join(methods)!r} names no method; name one, or leave the option out "
             "for the default, generic,vap."
         )
-    settings: dict[str, Any] = {
+    settings = {
         field.name: getattr(asked, field.name)
         for field in fields(Study)
         if hasattr(asked, field.name) and field.name not in ("methods", "policy")

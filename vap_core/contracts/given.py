@@ -58,13 +58,16 @@ def made(name: str) -> Any:
 
 def _needed(function: Any) -> list[str]:
     """The parameters of a function that have no default."""
-    needed = []
-    for parameter in inspect.signature(function).parameters.values():
-        if parameter.default is parameter.empty and parameter.kind not in (
+    needed = [
+        parameter.name
+        for parameter in inspect.signature(function).parameters.values()
+        if parameter.default is parameter.empty
+        and parameter.kind
+        not in (
             parameter.VAR_POSITIONAL,
             parameter.VAR_KEYWORD,
-        ):
-            needed.append(parameter.name)
+        )
+    ]
     return needed
 
 

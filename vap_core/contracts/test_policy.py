@@ -25,21 +25,13 @@ def episodes(policy: Any, where: str, batch: int) -> list[Episode]:
 
 
 def actions(of: Sequence[Episode]) -> np.ndarray:
-    taken = []
-    for episode in of:
-        for frame in episode.frames:
-            if frame.action is not None:
-                taken.append(frame.action)
-    return np.array(taken)
+    taken = (frame.action for episode in of for frame in episode.frames)
+    return np.array([action for action in taken if action is not None])
 
 
 def states(of: Sequence[Episode]) -> np.ndarray:
     """The robot's state at every step: what the simulator made of the actions."""
-    seen = []
-    for episode in of:
-        for frame in episode.frames:
-            seen.append(frame.state)
-    return np.array(seen)
+    return np.array([frame.state for episode in of for frame in episode.frames])
 
 
 def check_close(some: Sequence[Episode], others: Sequence[Episode]) -> None:

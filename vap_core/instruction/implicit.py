@@ -262,7 +262,7 @@ class Reading:
     def _used(self, said: str, candidates: list[PersonalObject], user: str = "") -> PersonalObject:
         """The one of `candidates` that the person whom the words name used last, on their day."""
         context = self.context
-        by: str | None = fold(context.speaker) or None
+        by = fold(context.speaker) or None
         if user:
             by = find_owner(user, context.speaker, context.owners)
         person = person_pattern(context)
@@ -341,22 +341,16 @@ class Reading:
 
         "put my cup on the plate; the striped one stays" names the other cup.
         """
-        best: tuple[float, int] | None = None
-        categories = self._categories()
-        known = self._known_words(category)
-        for other in self.expressions:
-            if other is self.expression or other.destination:
-                continue
-            if find_category(other.said, categories) not in (None, category):
-                continue
-            words = content(other.said, known)
-            if words:
-                order, lead = self._ranked(words, candidates)
-                if best is None or lead > best[0]:
-                    best = lead, int(order[0])
-        if best is None or best[0] < MARGIN:
-            return candidates
-        return [obj for obj in candidates if obj is not candidates[best[1]]]
+        others = [
+            content(other.said, self._known_words(category))
+            for other in self.expressions
+            if other is not self.expression
+            and not other.destination
+            and find_category(other.said, self._categories()) in (None, category)
+        ]
+        ranked = [self._ranked(words, candidates) for words in others if words]
+        order, lead = max(ranked, key=lambda each: each[1], default=([], 0.0))
+        return [obj for i, obj in enumerate(candidates) if lead < MARGIN or i != order[0]]
 
     def _ranked(self, words: str, candidates: Sequence[PersonalObject]) -> tuple[list[int], float]:
         """The places of at least two candidates, best first, and the lead of the first."""

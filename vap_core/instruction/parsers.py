@@ -230,7 +230,7 @@ class ChatParser:
 
 def _in_words(context: Context, name: str) -> dict[str, Any]:
     obj = context.objects[name]
-    about: dict[str, Any] = {"object": obj.name, "category": obj.category}
+    about = {"object": obj.name, "category": obj.category}
     if obj.owner:
         about["owner"] = obj.owner
     if obj.note:

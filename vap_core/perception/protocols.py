@@ -20,7 +20,7 @@ from vap_core.base.types import Boxes, Rgb, Track
 class Detector(Protocol):
     """Finds every box that matches an open-vocabulary phrase (P 3.3).
 
-    Or proposes boxes of any object, and gives each a `Boxes.prior` by the phrase.
+    Or proposes boxes of any object.
     """
 
     def __call__(
@@ -46,8 +46,10 @@ class FamiliarityJudge(Protocol):
 class ReferenceCropper(Protocol):
     """A detector that looks for the object of a reference photo otherwise than in a scene."""
 
-    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
-        """Where the object may be, with priors; empty when nothing scores `threshold`."""
+    def reference_boxes(
+        self, photo: Rgb, phrase: str, threshold: float
+    ) -> tuple[Boxes, Float32[np.ndarray, " n"]]:
+        """Where the object may be, and the evidence for each; empty below `threshold`."""
         ...
 
 

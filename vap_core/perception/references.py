@@ -142,17 +142,15 @@ def whole_photos(photos: Sequence[Rgb]) -> tuple[Reference, ...]:
 def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) -> Boxes:
     """The candidates of a photo: the given box first, then what is proposed."""
     if isinstance(detector, ReferenceCropper):
-        found = detector.reference_boxes(photo, category, THRESHOLD)
+        found, _ = detector.reference_boxes(photo, category, THRESHOLD)
     else:
         (found,) = detector([photo], category, THRESHOLD)
     xyxy = found.xyxy[:MOST_BOXES]
     score = found.score[:MOST_BOXES]
-    evidence = np.log(score + np.float32(1e-3)) * np.float32(SCORE_WEIGHT)
     if given is not None:
         xyxy = np.concatenate([given[None], xyxy])
         score = np.concatenate([np.ones(1, np.float32), score])
-        evidence = np.concatenate([np.zeros(1, np.float32), evidence])
-    return Boxes(xyxy, score, category, prior=evidence)
+    return Boxes(xyxy, score, category)
 
 
 def _choose(
@@ -198,13 +196,13 @@ def _score(
 
 def _prior(photo: Rgb, boxes: Boxes) -> Float[np.ndarray, " n"]:
     """What speaks for each box of one photo before others are looked at."""
-    assert boxes.prior is not None
     height, width = photo.shape[:2]
     size = np.array([width, height])
     centre = (boxes.xyxy[:, :2] + boxes.xyxy[:, 2:]) / 2 / size
     away = np.hypot(*(centre - 0.5).T)
     area = (boxes.xyxy[:, 2:] - boxes.xyxy[:, :2]).prod(axis=1) / (width * height)
-    return boxes.prior - CENTRE_WEIGHT * away + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
+    evidence = np.log(boxes.score + np.float32(1e-3)) * np.float32(SCORE_WEIGHT)
+    return evidence - CENTRE_WEIGHT * away + AREA_WEIGHT * np.log(np.clip(area, 0.01, 1))
 
 
 def _whole(photo: Rgb, doubt: str) -> Reference:

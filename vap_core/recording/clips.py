@@ -119,17 +119,12 @@ def log_clip_step(rec: rr.RecordingStream, camera: str, step: ClipStep) -> None:
     root = image_root(camera)
     jpeg = encode_jpeg(step.image, JPEG_QUALITY)
     log_row(rec, root, jpeg_image(jpeg), at=at)
-    prompted = jpeg
-    if step.prompted is not step.image:
-        prompted = encode_jpeg(step.prompted, JPEG_QUALITY)
+    prompted = encode_jpeg(step.prompted, JPEG_QUALITY) if step.prompted is not step.image else jpeg
     log_row(rec, f"{root}/prompted", jpeg_image(prompted), at=at)
-    shown = np.zeros(step.image.shape[:2], bool)
-    if step.track.mask is not None:
-        shown = step.track.mask
+    shown = step.track.mask if step.track.mask is not None else np.zeros(step.image.shape[:2], bool)
     mask = rr.SegmentationImage(track_image(shown), opacity=1.0)
     log_row(rec, f"{root}/mask/target", mask, at=at)
-    score = rr.Scalars([step.track.score])
-    log_row(rec, f"/vap/track_score/{camera}", score, at=at)
+    log_row(rec, f"/vap/track_score/{camera}", rr.Scalars([step.track.score]), at=at)
 
 
 class DatasetRecorder:

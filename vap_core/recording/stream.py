@@ -223,10 +223,11 @@ def log_row(
 
     As a column of its own it keeps its place in the file; `rec.log` may move it.
     """
-    columns = []
-    for archetype in archetypes:
-        for batch in archetype.as_component_batches():
-            columns.append(batch.partition([len(batch.as_arrow_array())]))
+    columns = [
+        batch.partition([len(batch.as_arrow_array())])
+        for archetype in archetypes
+        for batch in archetype.as_component_batches()
+    ]
     rec.send_columns(entity, at, columns)
 
 

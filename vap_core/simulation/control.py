@@ -261,8 +261,7 @@ def rotation(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 
 def rotation_vector(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
     """The rotation vector, rad, of a rotation matrix; its length is at most pi."""
-    turn = mink.SO3.from_matrix(np.ascontiguousarray(matrix))
-    return np.asarray(turn.log())
+    return np.asarray(mink.SO3.from_matrix(np.ascontiguousarray(matrix)).log())
 
 
 def pose_transform(pose: Pose) -> mink.SE3:

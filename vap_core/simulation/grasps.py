@@ -193,8 +193,7 @@ def _clearance(
     """
     least = 1.0
     across = np.array([-axis[1], axis[0]])
-    reach = robot.opening_m / 2 + FINGER_M
-    fingers = (z - 0.012, reach, PAD_M)
+    fingers = (z - 0.012, robot.opening_m / 2 + FINGER_M, PAD_M)
     palm = (z + robot.palm_m, robot.hand_m[0], robot.hand_m[1])
     for points in others:
         for low, long, wide in (fingers, palm):

@@ -117,8 +117,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """All cameras side by side, when made with `render_mode="rgb_array"`."""
         if self.render_mode is None:
             return None
-        images = self._env.observe().images
-        return np.concatenate(list(images.values()), axis=1)
+        return np.concatenate(list(self._env.observe().images.values()), axis=1)
 
     def close(self) -> None:
         """Release the compiled scenes."""
@@ -157,8 +156,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def _listed_row(self, options: dict[str, Any]) -> EpisodeRow:
         """The row of the asked episode, or of one drawn at random."""
-        drawn = int(self.np_random.integers(len(self.rows)))
-        number = options.get("episode", drawn)
+        number = options.get("episode", int(self.np_random.integers(len(self.rows))))
         if number not in range(len(self.rows)):
             name = self.spec.id if self.spec else "the list"
             raise BadSuite(f"reset: no episode {number!r}; {name} has 0 .. {len(self.rows) - 1}.")
@@ -182,8 +180,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         key = (row.variant, models)
         if key not in self._scenes:
             if len(self._scenes) >= MOST_SCENES:
-                oldest = next(iter(self._scenes))
-                self._scenes.pop(oldest).close()
+                self._scenes.pop(next(iter(self._scenes))).close()
             self._scenes[key] = build_scene(self.suite.name, models, row.variant, self.robots)
         return self._scenes[key]
 

@@ -90,8 +90,7 @@ def _is_done(homing: Homing, env: Env) -> bool:
     command = env.command
     if homing.part == "open":
         return command.gripper > 0.99
-    goal = _goal(homing, env)
-    off = goal[:3, 3] - env.tcp_base()[:3, 3]
+    off = _goal(homing, env)[:3, 3] - env.tcp_base()[:3, 3]
     if homing.part == "rise":
         return bool(abs(off[2]) < ARRIVED_M)
     if env.control == "joint":

@@ -227,8 +227,7 @@ def _outline(
 
 def _colours(model: mujoco.MjModel, links: Sequence[str]) -> tuple[Rgb01, Rgb01]:
     """The robot's colours at its middle link and at its hand."""
-    middle = _body_colour(model, links[len(links) // 2])
-    return middle, _body_colour(model, links[-1])
+    return _body_colour(model, links[len(links) // 2]), _body_colour(model, links[-1])
 
 
 def _body_colour(model: mujoco.MjModel, name: str) -> Rgb01:

@@ -202,8 +202,7 @@ def _add_materials(spec: mujoco.MjSpec, style: SceneStyle) -> None:
     wood.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "planks"
     red, green, blue = dark
     legs = (0.55 * red, 0.55 * green, 0.55 * blue)
-    plain = {"wall": style.wall, "floor": style.floor, "legs": legs}
-    for name, rgb in plain.items():
+    for name, rgb in {"wall": style.wall, "floor": style.floor, "legs": legs}.items():
         spec.add_material(name=name, rgba=[*rgb, 1.0], specular=0.0, shininess=0.0)
 
 

@@ -183,10 +183,11 @@ class EpisodeRow:
         subgoal = self.subgoals[stage]
         rest = [place for place in self.placements if place.model != subgoal.target]
         (first,) = [place for place in self.placements if place.model == subgoal.target]
-        inside = []
-        for earlier in self.subgoals[:stage]:
-            if earlier.rule == "put" and earlier.goal == subgoal.goal:
-                inside.append(earlier.target)
+        inside = [
+            earlier.target
+            for earlier in self.subgoals[:stage]
+            if earlier.rule == "put" and earlier.goal == subgoal.goal
+        ]
         return replace(
             self,
             instruction=subgoal.instruction,
@@ -233,8 +234,7 @@ def of_subgoals(outcomes: Sequence[Outcome], stages: int, steps: int) -> Outcome
     It succeeds where every sub-goal had succeeded at its own end, in order. A wrong object in any
     of them counts. `steps` are all, with the way home in between.
     """
-    successes = [outcome.success for outcome in outcomes]
-    success = len(outcomes) == stages and all(successes)
+    success = len(outcomes) == stages and all([outcome.success for outcome in outcomes])
     error = outcomes[-1].status == "error"
     moved = [outcome.cmr for outcome in outcomes if outcome.cmr is not None]
     status: Literal["success", "failure", "error"] = "success" if success else "failure"

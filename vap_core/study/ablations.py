@@ -243,8 +243,16 @@ def effects_figure(arms: "pd.DataFrame", title: str = "", columns: int = 1) -> "
     )
     label = f"points of success against the first arm [95 %]; filled: exact p < {LEVEL:g}, Holm"
     series = "series" if lines["series"].nunique() > 1 else ""
-    look: dict[str, Any] = dict(group="heading", panel="panel", series=series, title=title)
-    return charts.dots(lines, "arm", label=label, limits=(-103.0, 48.0), **look)
+    return charts.dots(
+        lines,
+        "arm",
+        label=label,
+        limits=(-103.0, 48.0),
+        group="heading",
+        panel="panel",
+        series=series,
+        title=title,
+    )
 
 
 def rates_figure(arms: "pd.DataFrame") -> "Figure":
@@ -258,8 +266,9 @@ def sweep_figure(arms: "pd.DataFrame", places: dict[str, float], label: str) -> 
     rates = tidy(arms[arms["arm"].isin(places)][["suite", "arm", "sr", "paper"]], ["sr"])
     rates = rates.assign(x=rates["arm"].map(places)).sort_values("x", kind="stable")
     names = rates["suite"] + ", n " + rates["n"].astype(str)
-    look: dict[str, Any] = dict(panel="panel", label="success rate, % (95 %)", label_x=label)
-    return charts.curves(rates.assign(panel=names), "x", **look)
+    return charts.curves(
+        rates.assign(panel=names), "x", panel="panel", label="success rate, % (95 %)", label_x=label
+    )
 
 
 def policies_figure(arms: "pd.DataFrame", label: str) -> "Figure":

@@ -203,7 +203,7 @@ class Observer:
         maps = {name: np.stack([of[c] for c in areas]) for name, of in found.items()}
         regions = {name: np.stack([a[name] for a in areas.values()]) for name in REGIONS}
         for name, heat in maps.items():
-            row: dict[str, Any] = {"step": frame.frame_index, "measure": name}
+            row = {"step": frame.frame_index, "measure": name}
             for region, area in regions.items():
                 row[f"share_{region}"] = float((heat * area).sum() / max(float(heat.sum()), 1e-12))
                 row[f"chance_{region}"] = float(area.mean())
@@ -370,13 +370,8 @@ def run_job(job: Job) -> dict[str, Rows]:
         # An episode that ended in an error before its first call has no observer.
         observer = observers.get(key) or Observer(episode.header, policy)
         row, outcome = episode.header.row, episode.outcome
-        about = {
-            "suite": row.suite,
-            "task": row.task,
-            "method": episode.header.method,
-            "seed": row.seed,
-            "episode": row.episode,
-        }
+        about = {name: getattr(row, name) for name in ("suite", "task", "seed", "episode")}
+        about["method"] = job.method
         step, touched = observer.first_touch or (None, NOTHING)
         ending = {
             "policy": episode.header.policy,

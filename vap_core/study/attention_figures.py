@@ -401,10 +401,9 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     shown = pd.concat(marks)
     label = "attention per area before the first touch, whole view = 1 [95 %]"
     most = 1.05 * float(shown["high"].max())
-    look: dict[str, Any] = dict(
-        group="suite", series="region", label=label, scale=1.0, limits=(0.0, most)
+    return charts.dots(
+        shown, "line", group="suite", series="region", label=label, scale=1.0, limits=(0.0, most)
     )
-    return charts.dots(shown, "line", **look)
 
 
 def layers_figure(table: "pd.DataFrame") -> "Figure":
@@ -418,8 +417,16 @@ def layers_figure(table: "pd.DataFrame") -> "Figure":
         value=table["lift"],
     )
     label = "attention per area on the target"
-    look: dict[str, Any] = dict(panel="panel", series="query", label=label, scale=1.0, top=None)
-    return charts.curves(shown, "layer", label_x="layer", **look)
+    return charts.curves(
+        shown,
+        "layer",
+        label_x="layer",
+        panel="panel",
+        series="query",
+        label=label,
+        scale=1.0,
+        top=None,
+    )
 
 
 def patterns_figure(counts: "pd.DataFrame") -> "Figure":
@@ -432,8 +439,13 @@ def patterns_figure(counts: "pd.DataFrame") -> "Figure":
             won = line[f"{name}, success"]
             about = {"of": f"{line['suite']}, {line['method']}", "localisation": name}
             lines.append({**about, "n": line["n"], "success": won, "failure": line[name] - won})
-    look: dict[str, Any] = dict(group="of", label="% of episodes (in the bars: how many)")
-    return charts.stacked(pd.DataFrame(lines), "localisation", ["success", "failure"], **look)
+    return charts.stacked(
+        pd.DataFrame(lines),
+        "localisation",
+        ["success", "failure"],
+        group="of",
+        label="% of episodes (in the bars: how many)",
+    )
 
 
 def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
@@ -465,7 +477,12 @@ def time_figure(calls: "pd.DataFrame", episodes: "pd.DataFrame") -> "Figure":
         ]
         titles[method] = f"{method}: of episodes that touch something\n{', '.join(told)}"
     lines["method"] = lines["method"].map(titles)
-    look: dict[str, Any] = dict(
-        panel="method", series="ends", label="peak on the target, %", dashed=["chance"]
+    return charts.curves(
+        lines,
+        "left",
+        label_x="calls before the first touch",
+        panel="method",
+        series="ends",
+        label="peak on the target, %",
+        dashed=["chance"],
     )
-    return charts.curves(lines, "left", label_x="calls before the first touch", **look)

@@ -1,7 +1,8 @@
 """Cases 1, 2 and 3 of a failed episode, from the trace of its frames, and their thresholds."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from vap_core.simulation import robots
 from vap_core.simulation.control import pose_transform
 from vap_core.simulation.suites import suite
 from vap_core.simulation.suites.rules import HELD_STEPS, LIFT_M, MOVED_M, Judge
-from vap_core.simulation.types import Pose
+from vap_core.simulation.types import Pose, Truth
 
 
 @dataclass(frozen=True)
@@ -66,85 +67,57 @@ def has_truth(episode: Episode) -> bool:
 
 def trace_episode(episode: Episode) -> EpisodeTrace:
     """The trace of an episode that has ground truth."""
-    header = episode.header
-    frames = episode.frames
+    header, frames = episode.header, episode.frames
     row = header.row
-    judge = Judge.start(row, header.object_sizes_m, frames[0].truth)
+    truths = [frame.truth for frame in frames]
+    judge = Judge.start(row, header.object_sizes_m, truths[0])
     names = _without(judge.start_world, row.goal)
     base = robots.get(suite(row.suite).robot).base_world
     size = header.object_sizes_m[row.target]
+    touched = [_without(truth.touched, row.goal) for truth in truths]
+    coverage = tuple(frame.coverage for frame in frames)
+    first = {camera: each[0] for camera, each in header.groundings.items() if each}
+    grip = [np.nan if frame.action is None else float(frame.action[-1]) for frame in frames]
 
-    steps = []
-    coverage = []
-    others = []
-    touches = []
-    held = []
-    gap_m = []
-    grip = []
-    lift_m, moved_m = np.zeros((2, len(names), len(frames)))
-    for step, frame in enumerate(frames):
-        truth = frame.truth
-        steps.append(frame.frame_index)
-        coverage.append(frame.coverage)
-        touched = _without(truth.touched, row.goal)
-        others.append(tuple(_without(touched, row.target)))
-        touches.append(row.target in touched)
-        held.append(truth.held)
-        gap_m.append(_gap_m(frame, truth.objects_world[row.target], size, base))
-        grip.append(np.nan if frame.action is None else float(frame.action[-1]))
-        for i, name in enumerate(names):
-            lift_m[i, step] = truth.objects_world[name][2] - judge.start_world[name][2]
-            moved_m[i, step] = judge.strayed_m(name, truth)
+    def over_time(of: Callable[[str, Truth], float]) -> dict[str, np.ndarray]:
+        return {name: np.array([of(name, truth) for truth in truths]) for name in names}
 
-    candidates = {}
-    rejected = []
-    overruled = []
-    for camera, per_target in header.groundings.items():
-        candidates[camera] = len(per_target[0].candidates) if per_target else 0
-        if per_target and per_target[0].rejected is not None:
-            rejected.append(camera)
-        if per_target and per_target[0].overruled:
-            overruled.append(camera)
     return EpisodeTrace(
         target=row.target,
         rule=row.rule,
-        steps=tuple(steps),
-        coverage=tuple(coverage),
-        others=tuple(others),
-        touches=tuple(touches),
-        held=tuple(held),
-        gap_m=np.array(gap_m),
-        lift_m=dict(zip(names, lift_m, strict=True)),
-        moved_m=dict(zip(names, moved_m, strict=True)),
+        steps=tuple(frame.frame_index for frame in frames),
+        coverage=coverage,
+        others=tuple(tuple(_without(each, row.target)) for each in touched),
+        touches=tuple(row.target in each for each in touched),
+        held=tuple(truth.held for truth in truths),
+        gap_m=np.array(
+            [_gap_m(frame, frame.truth.objects_world[row.target], size, base) for frame in frames]
+        ),
+        lift_m=over_time(lambda name, t: t.objects_world[name][2] - judge.start_world[name][2]),
+        moved_m=over_time(judge.strayed_m),
         grip=np.array(grip),
-        candidates=candidates,
+        candidates={camera: len(each.candidates) for camera, each in first.items()},
         prompted=any(coverage),
-        rejected=frozenset(rejected),
-        overruled=frozenset(overruled),
+        rejected=frozenset(camera for camera, each in first.items() if each.rejected is not None),
+        overruled=frozenset(camera for camera, each in first.items() if each.overruled),
     )
 
 
 def first_true(flags: Sequence[object]) -> int | None:
     """The index of the first true flag, or of the first sequence that is not empty."""
-    for i, flag in enumerate(flags):
-        if flag:
-            return i
-    return None
+    return next((i for i, flag in enumerate(flags) if flag), None)
 
 
 def true_runs(flags: Sequence[bool]) -> list[tuple[int, int]]:
     """Start and stop of every unbroken run of True."""
-    padded = np.array([False, *flags, False]).astype(int)
-    edges = np.flatnonzero(np.diff(padded)).tolist()
+    edges = np.flatnonzero(np.diff(np.array([False, *flags, False]).astype(int))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def carried(trace: EpisodeTrace, thresholds: Thresholds, name: str) -> list[bool]:
     """For every step, whether the robot carries an object."""
-    flags = []
-    for held, lift in zip(trace.held, trace.lift_m[name].tolist(), strict=True):
-        flags.append(name in held and lift >= thresholds.lift_m)
-    return flags
+    steps = zip(trace.held, trace.lift_m[name].tolist(), strict=True)
+    return [name in held and lift >= thresholds.lift_m for held, lift in steps]
 
 
 def _gap_m(frame: Frame, pose: Pose, size: tuple[float, float, float], base: Pose) -> float:
@@ -154,8 +127,7 @@ def _gap_m(frame: Frame, pose: Pose, size: tuple[float, float, float], base: Pos
     """
     tcp = pose_transform(base).apply(frame.state[:3].astype(np.float64))
     local = pose_transform(pose).inverse().apply(tcp) - [0.0, 0.0, size[2] / 2]
-    outside = np.maximum(np.abs(local) - np.asarray(size) / 2, 0.0)
-    return float(np.linalg.norm(outside))
+    return float(np.linalg.norm(np.maximum(np.abs(local) - np.asarray(size) / 2, 0.0)))
 
 
 def _without(names: Iterable[str], excluded: str) -> list[str]:
@@ -173,46 +145,49 @@ def wrong_prompt(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | Non
     wrong = _wrong_flags(judged)
     if not any(wrong):
         return None
-    start, stop = _deciding_run(wrong, whole)
+    # The longest run of wrong steps; where they are not wrong as a whole, the last one.
+    start, stop = max(
+        true_runs(wrong), key=lambda run: run[1] - run[0] if whole else run[1] == len(wrong)
+    )
     kinds = [verdict for _, verdict in judged[start:stop]]
-    case: Literal["case 1", "case 2"] = "case 1"
-    if 2 * kinds.count("case 2") >= len(kinds):
-        case = "case 2"
+    case: Literal["case 1", "case 2"] = (
+        "case 2" if 2 * kinds.count("case 2") >= len(kinds) else "case 1"
+    )
     at, _ = judged[start + kinds.index(case)]
-
+    step = trace.steps[at]
     labels = _labels(trace.coverage[at], thresholds)
     view = _most_wrong(trace.coverage[at], labels, trace.target)
+    sub_case = "views drift apart" if case == "case 2" else "drift"
     if at == judged[0][0]:
         sub_case = _opening_sub_case(trace, case, view, thresholds)
-    elif case == "case 2":
-        sub_case = "views drift apart"
-    else:
-        sub_case = "drift"
-    share = float(np.mean(wrong))
-    chosen_by_vote = view.camera not in trace.overruled
-    if sub_case == "drift":
-        words = _drift_words(view, trace.target, trace.steps[at])
-    else:
-        words = _sentence(sub_case, view, labels, trace.steps[at], chosen_by_vote=chosen_by_vote)
+    evidence: dict[str, float | str] = {
+        "wrong_share": float(np.mean(wrong)),
+        "judged_steps": float(len(wrong)),
+        "iou": view.iou,
+        "pixels": float(view.pixels),
+        **{f"shows_{camera}": label or "nothing" for camera, label in labels.items()},
+    }
+    if np.isfinite(view.proposal):
+        evidence["proposal"] = view.proposal
+    words = _sentence(sub_case, view, labels, step, trace)
+    how_many = f"all {len(wrong)}" if all(wrong) else f"{sum(wrong)} of {len(wrong)}"
+    checked = "the one frame" if len(wrong) == 1 else f"{how_many} frames"
     return Diagnosis(
         case=case,
         sub_case=sub_case,
-        frame_index=trace.steps[at],
+        frame_index=step,
         camera=view.camera,
-        evidence=_evidence(view, labels, share, len(wrong)),
+        evidence=evidence,
         confidence=1.0,
-        sentence=f"{words}; {_wrong_words(wrong)}",
+        sentence=f"{words}; wrong in {checked} checked",
     )
 
 
 def verdicts(trace: EpisodeTrace, thresholds: Thresholds, until: int) -> list[Judged]:
     """The judged steps before `until`."""
-    judged = []
-    for i, coverage in enumerate(trace.coverage[: max(until, 1)]):
-        verdict = _verdict(coverage, trace.target, thresholds)
-        if verdict is not None:
-            judged.append((i, verdict))
-    return judged
+    steps = enumerate(trace.coverage[: max(until, 1)])
+    found = ((i, _verdict(coverage, trace.target, thresholds)) for i, coverage in steps)
+    return [(i, verdict) for i, verdict in found if verdict is not None]
 
 
 def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[Judged], bool]:
@@ -223,42 +198,26 @@ def _deciding_steps(trace: EpisodeTrace, thresholds: Thresholds) -> tuple[list[J
     Those up to the first touch of any object, when they are wrong in enough steps; else those up to
     where the hand comes to touch another object that a prompt is on.
     """
-    touched = first_true(trace.touches)
-    strayed = first_true(trace.others)
-    until = len(trace.steps)
-    for at in (touched, strayed):
-        if at is not None:
-            until = min(until, at)
-    judged = verdicts(trace, thresholds, until)
+    every = verdicts(trace, thresholds, until=len(trace.steps))
+
+    def before(at: int) -> list[Judged]:
+        return [each for each in every if each[0] < max(at, 1)]
+
+    touches = [each for each in map(first_true, (trace.touches, trace.others)) if each is not None]
+    judged = before(min(touches, default=len(trace.steps)))
     if judged and float(np.mean(_wrong_flags(judged))) >= thresholds.share:
         return judged, True
-    if strayed is None:
-        return [], False
-    every = verdicts(trace, thresholds, until=len(trace.steps))
-    before: set[str] = set()
-    for at, touching in enumerate(trace.others):
-        reached = set(touching) - before
-        before = set(touching)
-        if not reached:
-            continue
-        judged = [each for each in every if each[0] < max(at, 1)]
-        if not judged or judged[-1][1] == "right":
-            continue
-        last, _ = judged[-1]
-        if any(view.object in reached for view in trace.coverage[last]):
-            return judged, False
+    for at, (earlier, touching) in enumerate(pairwise([(), *trace.others])):
+        reached, judged = set(touching) - set(earlier), before(at)
+        if reached and judged and judged[-1][1] != "right":
+            last, _ = judged[-1]
+            if any(view.object in reached for view in trace.coverage[last]):
+                return judged, False
     return [], False
 
 
 def _wrong_flags(judged: Sequence[Judged]) -> list[bool]:
     return [verdict != "right" for _, verdict in judged]
-
-
-def _deciding_run(wrong: Sequence[bool], whole: bool) -> tuple[int, int]:
-    """The longest run of wrong steps; where they are not wrong as a whole, the last one."""
-    if whole:
-        return max(true_runs(wrong), key=lambda run: run[1] - run[0])
-    return max(true_runs(wrong), key=lambda run: run[1] == len(wrong))
 
 
 def _verdict(
@@ -269,28 +228,13 @@ def _verdict(
     match compare_views(labels, target):
         case "nothing":
             return "case 1" if labels else None
-        case "right":
-            return _verdict_on_target(coverage, labels, target, thresholds)
+        case "right":  # are they good enough in any view?
+            views = [view for view in coverage if labels.get(view.camera) == target]
+            covered = max([0.0, *(view.iou for view in views)]) >= thresholds.iou
+            small = max([0, *(view.pixels for view in views)]) < thresholds.pixels
+            return "right" if covered or small else "case 1"
         case wrong:
             return wrong
-
-
-def _verdict_on_target(
-    coverage: Sequence[MaskCoverage],
-    labels: Mapping[str, str | None],
-    target: str,
-    thresholds: Thresholds,
-) -> Verdict:
-    """Of a step whose prompts are all on the target: are they good enough in any view?"""
-    iou = 0.0
-    pixels = 0
-    for view in coverage:
-        if labels.get(view.camera) == target:
-            iou = max(iou, view.iou)
-            pixels = max(pixels, view.pixels)
-    if iou >= thresholds.iou or pixels < thresholds.pixels:
-        return "right"
-    return "case 1"
 
 
 def _labels(coverage: Sequence[MaskCoverage], thresholds: Thresholds) -> dict[str, str | None]:
@@ -316,8 +260,7 @@ def _most_wrong(
         label = labels[view.camera]
         return label not in (target, None), label is None, -view.iou
 
-    counting = [view for view in coverage if view.camera in labels]
-    return max(counting, key=wrongness)
+    return max((view for view in coverage if view.camera in labels), key=wrongness)
 
 
 def _opening_sub_case(
@@ -336,83 +279,42 @@ def _opening_sub_case(
     return "distractor vote"
 
 
-def _evidence(
-    view: MaskCoverage, labels: Mapping[str, str | None], share: float, steps: int
-) -> dict[str, float | str]:
-    evidence: dict[str, float | str] = {
-        "wrong_share": share,
-        "judged_steps": float(steps),
-        "iou": view.iou,
-        "pixels": float(view.pixels),
-    }
-    for camera, label in labels.items():
-        evidence[f"shows_{camera}"] = label or "nothing"
-    if np.isfinite(view.proposal):
-        evidence["proposal"] = view.proposal
-    return evidence
-
-
 def _sentence(
     sub_case: str,
     view: MaskCoverage,
     labels: Mapping[str, str | None],
     step: int,
-    *,
-    chosen_by_vote: bool,
+    trace: EpisodeTrace,
 ) -> str:
-    camera = view.camera
-    iou = f"{view.iou:.2f}"
-    proposal = f"{view.proposal:.2f}"
-    name = _named(view.object)
-    parts = []
-    for of_view, label in labels.items():
-        parts.append(f"{of_view} {_named(label)}")
-    shown = ", ".join(parts)
-    match sub_case:
-        case "no proposal":
-            return f"{camera}: no candidate was found, the target passes unmarked"
-        case "not in view":
-            return f"{camera}: the best candidate is too unlike the references to be highlighted"
-        case "shifted proposal":
-            if np.isnan(view.proposal):
-                return f"{camera}: the target cannot be seen; {name} is highlighted"
-            return f"{camera}: no box fits the target (best IoU {proposal}); {name} is highlighted"
-        case "distractor vote":
-            choice = f"the vote elected {name}"
-            if not chosen_by_vote:
-                choice = f"{name} was chosen against the vote"
-            return f"{camera}: the target was proposed (IoU {proposal}), and {choice}"
-        case "poor mask":
-            return f"{camera}: the mask misses most of the target (IoU {iou})"
-        case "views disagree":
-            return f"the views show different things from the start: {shown}"
-    return f"the views agreed at first; at step {step} they show different things: {shown}"
-
-
-def _drift_words(view: MaskCoverage, target: str, step: int) -> str:
-    """A track that still lies on the target drifted by covering it badly."""
-    found = f"is on {_named(view.object)}"
-    if view.object == target:
-        found = f"covers the target badly (IoU {view.iou:.2f})"
-    return f"{view.camera}: right at first, from step {step} on the track {found}"
-
-
-def _wrong_words(wrong: Sequence[bool]) -> str:
-    """In how many of the judged steps the prompts were wrong."""
-    if len(wrong) == 1:
-        return "wrong in the one frame checked"
-    n = sum(wrong)
-    if n == len(wrong):
-        return f"wrong in all {n} frames checked"
-    return f"wrong in {n} of {len(wrong)} frames checked"
+    iou, proposal, name = f"{view.iou:.2f}", f"{view.proposal:.2f}", _named(view.object)
+    shown = ", ".join(f"{camera} {_named(label)}" for camera, label in labels.items())
+    overruled = view.camera in trace.overruled
+    choice = f"{name} was chosen against the vote" if overruled else f"the vote elected {name}"
+    unboxed = f"no box fits the target (best IoU {proposal})"
+    unboxed = "the target cannot be seen" if np.isnan(view.proposal) else unboxed
+    # A track that still lies on the target drifted by covering it badly.
+    poor = view.object == trace.target
+    found = f"covers the target badly (IoU {iou})" if poor else f"is on {name}"
+    of_views = {
+        "views disagree": f"the views show different things from the start: {shown}",
+        "views drift apart": f"the views agreed at first; at step {step} they show different "
+        f"things: {shown}",
+    }
+    of_view = {
+        "no proposal": "no candidate was found, the target passes unmarked",
+        "not in view": "the best candidate is too unlike the references to be highlighted",
+        "shifted proposal": f"{unboxed}; {name} is highlighted",
+        "distractor vote": f"the target was proposed (IoU {proposal}), and {choice}",
+        "poor mask": f"the mask misses most of the target (IoU {iou})",
+        "drift": f"right at first, from step {step} on the track {found}",
+    }
+    return of_views.get(sub_case) or f"{view.camera}: {of_view[sub_case]}"
 
 
 def _named(label: str | None) -> str:
     if label is None:
         return "nothing"
-    if label == "" or label.startswith("nothing in "):
-        return "no object"
-    return label
+    return "no object" if label == "" or label.startswith("nothing in ") else label
 
 
 def failed_manipulation(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis:
@@ -432,27 +334,26 @@ def failed_manipulation(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosi
 
 def _lost_target(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
     """A target that was carried is still held, let go in the wrong place, or has slipped."""
-    held = carried(trace, thresholds, trace.target)
     target = trace.target
+    held = carried(trace, thresholds, target)
     if True not in held:
         return None
     last = len(held) - 1 - held[::-1].index(True)
     if last == len(held) - 1:
         lift_cm = 100 * trace.lift_m[target][last]
         return _diagnosis(trace, "timeout", last, f"still holds {target}, {lift_cm:.0f} cm up,")
-    grip = float(trace.grip[last])
     around = trace.grip[max(last - 1, 0) : last + 2]
-    if trace.rule != "picked" and np.nanmax(around) >= thresholds.closed:
-        sentence = f"lets go of {target} in the wrong place"
-        return _diagnosis(trace, "misplacement", last, sentence, grip=grip)
-    return _diagnosis(trace, "slip", last, f"loses {target} out of the hand", grip=grip)
+    let_go = trace.rule != "picked" and np.nanmax(around) >= thresholds.closed
+    sub_case, sentence = "slip", f"loses {target} out of the hand"
+    if let_go:
+        sub_case, sentence = "misplacement", f"lets go of {target} in the wrong place"
+    return _diagnosis(trace, sub_case, last, sentence, grip=float(trace.grip[last]))
 
 
 def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
     target = trace.target
     touched = first_true(trace.touches)
-    picked = {name: _picked(trace, thresholds, name) for name in _others(trace)}
-    taken = _earliest(picked)
+    taken = _earliest({name: _picked(trace, thresholds, name) for name in _others(trace)})
     if taken is not None and (touched is None or taken[0] <= touched):
         at, name = taken
         sentence = f"takes {name} instead of {target}"
@@ -467,22 +368,20 @@ def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
 
 
 def _collision(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | None:
-    target = trace.target
-    touched = first_true(trace.touches)
-    strayed = first_true(trace.others)
-    moves: dict[str, int | None] = {}
-    for name in _others(trace):
-        moves[name] = first_true((trace.moved_m[name] >= thresholds.moved_m).tolist())
-    knocked = _earliest(moves)
-    verb = "knocks"
-    if trace.rule == "selected":
-        verb = "touches"
-        if strayed is not None and touched is not None and strayed <= touched:
-            knocked = strayed, trace.others[strayed][0]
+    touched, strayed = first_true(trace.touches), first_true(trace.others)
+    knocked = _earliest(
+        {
+            name: first_true((trace.moved_m[name] >= thresholds.moved_m).tolist())
+            for name in _others(trace)
+        }
+    )
+    selects = trace.rule == "selected"
+    if selects and strayed is not None and touched is not None and strayed <= touched:
+        knocked = strayed, trace.others[strayed][0]
     if knocked is None or (touched is not None and touched < knocked[0]):
         return None
     at, name = knocked
-    sentence = f"{verb} {name} on its way to {target}"
+    sentence = f"{'touches' if selects else 'knocks'} {name} on its way to {trace.target}"
     return _diagnosis(trace, "collision", at, sentence, object=name)
 
 
@@ -491,10 +390,11 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
         return None
     near = trace.gap_m <= thresholds.near_m
     touched = first_true(trace.touches)
-    closing = first_true((near & (trace.grip < thresholds.closed)).tolist())
-    if closing is not None and (touched is None or closing < touched):
-        at = closing
-        sentence = _closing_words(trace, at)
+    at = first_true((near & (trace.grip < thresholds.closed)).tolist())
+    if at is not None and (touched is None or at < touched):
+        distance = _distance_words(trace, at)
+        words = f"closes around {trace.target} without touching it"
+        sentence = f"closes beside {trace.target}{distance}" if distance else words
     elif touched is not None:
         at = touched
         sentence = f"touches but does not grasp {trace.target}{_distance_words(trace, at)}"
@@ -503,20 +403,10 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
     return _diagnosis(trace, "missed grasp", at, sentence)
 
 
-def _closing_words(trace: EpisodeTrace, at: int) -> str:
-    """How the hand closes at step index `at`, at which it does not touch the target."""
-    distance = _distance_words(trace, at)
-    if not distance:
-        return f"closes around {trace.target} without touching it"
-    return f"closes beside {trace.target}{distance}"
-
-
 def _distance_words(trace: EpisodeTrace, at: int) -> str:
     """How far the tcp is from the target's bounding box; "" where it is in it, or at 0 mm."""
     gap_mm = round(1000 * trace.gap_m[at])
-    if gap_mm == 0:
-        return ""
-    return f" ({gap_mm} mm from its bounding box)"
+    return f" ({gap_mm} mm from its bounding box)" if gap_mm else ""
 
 
 def _closest_words(trace: EpisodeTrace, digits: int) -> str:
@@ -538,16 +428,13 @@ def _timeout(trace: EpisodeTrace) -> Diagnosis:
 def _diagnosis(
     trace: EpisodeTrace, sub_case: str, at: int, sentence: str, **evidence: float | str
 ) -> Diagnosis:
-    case: Case = "unprompted"
-    if trace.prompted:
-        case = "case 3"
     distances = {
         "gap_m": float(trace.gap_m[at]),
         "closest_m": float(trace.gap_m.min()),
         "lift_m": float(trace.lift_m[trace.target].max()),
     }
     return Diagnosis(
-        case=case,
+        case="case 3" if trace.prompted else "unprompted",
         sub_case=sub_case,
         frame_index=trace.steps[at],
         camera="",
@@ -578,11 +465,7 @@ def _picked(trace: EpisodeTrace, thresholds: Thresholds, name: str) -> int | Non
 
 def _earliest(at: Mapping[str, int | None]) -> tuple[int, str] | None:
     """The earliest step of any object, and the object."""
-    earliest = None
-    for name, step in at.items():
-        if step is not None and (earliest is None or (step, name) < earliest):
-            earliest = step, name
-    return earliest
+    return min(((step, name) for name, step in at.items() if step is not None), default=None)
 
 
 NARROW = 0.25
@@ -591,53 +474,30 @@ NARROW = 0.25
 
 def unlabelled(episode: Episode) -> Diagnosis:
     """The narrowest vote, lost tracks, and how differently similar the views' choices are."""
-    found = []
-    similarities = []
-    rejected = []
-    views_without = 0
-    for groundings in episode.header.groundings.values():
-        if not groundings:
-            continue
-        grounding = groundings[0]
-        if grounding.rejected is not None:
-            rejected.append(grounding)
-        if grounding.winner is None:
-            views_without += 1
-        else:
-            found.append(grounding)
-            similarities.append(float(grounding.similarity[grounding.winner].mean()))
-    margin = 0.0
-    camera = ""
-    disagreement = 0.0
-    if found:
-        narrowest = min(found, key=lambda grounding: grounding.ballot.margin)
-        margin = narrowest.ballot.margin
-        camera = narrowest.camera
-        disagreement = max(similarities) - min(similarities)
-    lost = []
-    for frame in episode.frames:
-        for event in frame.events:
-            if is_lost(event):
-                lost.append(event.frame_index)
-
+    first = [each[0] for each in episode.header.groundings.values() if each]
+    rejected = [grounding for grounding in first if grounding.rejected is not None]
+    found = [grounding for grounding in first if grounding.winner is not None]
+    similarities = [float(each.similarity[each.winner].mean()) for each in found] or [0.0]
+    narrowest = min(found, key=lambda grounding: grounding.ballot.margin, default=None)
+    margin = 0.0 if narrowest is None else narrowest.ballot.margin
+    camera = "" if narrowest is None else narrowest.camera
+    events = (event for frame in episode.frames for event in frame.events)
+    lost = [event.frame_index for event in events if is_lost(event)]
     at = 0
     if rejected and not found:
         camera = rejected[0].camera
         sub_case = "not in view"
         sentence = f"{camera}: {describe_rejection(rejected[0])}, and no other view has it"
     elif not found:
-        sub_case = "nothing found"
-        sentence = "no view has a candidate"
+        sub_case, sentence = "nothing found", "no view has a candidate"
     elif margin < NARROW:
         sub_case = "narrow vote"
         sentence = f"{camera}: the vote was won by {margin:.2f} of the references only"
     elif lost:
-        sub_case = "lost track"
-        at = lost[0]
-        sentence = f"the target was lost {len(lost)} times, first at step {lost[0]}"
+        sub_case, at = "lost track", lost[0]
+        sentence = f"the target was lost {len(lost)} times, first at step {at}"
     else:
-        sub_case = "no signal"
-        at = episode.frames[-1].frame_index
+        sub_case, at = "no signal", episode.frames[-1].frame_index
         sentence = "votes and tracks give no sign of the cause"
     return Diagnosis(
         case="unlabelled",
@@ -647,8 +507,8 @@ def unlabelled(episode: Episode) -> Diagnosis:
         evidence={
             "margin": margin,
             "lost": float(len(lost)),
-            "disagreement": disagreement,
-            "views_without": float(views_without),
+            "disagreement": max(similarities) - min(similarities),
+            "views_without": float(len(first) - len(found)),
         },
         confidence=0.0,
         sentence=sentence,

@@ -98,10 +98,14 @@ def _finish(figure: "Figure", title: str = "", columns: int = 4) -> "Figure":
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(name, handle)
     if handles:
-        where: dict[str, Any] = dict(
-            loc="outside lower center", ncols=columns, frameon=False, fontsize=8
+        figure.legend(
+            list(handles.values()),
+            list(handles),
+            loc="outside lower center",
+            ncols=columns,
+            frameon=False,
+            fontsize=8,
         )
-        figure.legend(list(handles.values()), list(handles), **where)
     if title:
         figure.suptitle(title, fontsize=11, fontweight="bold")
     return figure
@@ -249,8 +253,14 @@ def curves(
                 ends = scale * rows["low"], scale * rows["high"]
                 axes.fill_between(at, *ends, color=look["color"], alpha=0.15, linewidth=0)
             if "paper" in rows and rows["paper"].notna().any():
-                theirs: dict[str, Any] = dict(color=PAPER, fillstyle="none", label="the paper's")
-                axes.plot(at, scale * rows["paper"], "D--", **theirs)
+                axes.plot(
+                    at,
+                    scale * rows["paper"],
+                    "D--",
+                    color=PAPER,
+                    fillstyle="none",
+                    label="the paper's",
+                )
         if words:
             axes.set_xticks(range(len(places)), places, fontsize=8, rotation=20)
         axes.set(xlabel=label_x)
@@ -287,13 +297,23 @@ def bars(
             rows = part[part[series].astype(str) == name] if series else part
             at = np.array([own.index(group) for group in rows[x].astype(str)], float)
             at += (i - (len(names) - 1) / 2) * 0.84 / len(names)
-            look: dict[str, Any] = dict(
-                color=colours[name] if series else PLAIN, label=name or None
+            axes.bar(
+                at,
+                100 * rows["value"],
+                0.76 / len(names),
+                color=colours[name] if series else PLAIN,
+                label=name or None,
             )
-            axes.bar(at, 100 * rows["value"], 0.76 / len(names), **look)
             ends = _ends(rows.to_dict("records"))
-            bound: dict[str, Any] = dict(fmt="none", ecolor="black", capsize=2, linewidth=0.9)
-            axes.errorbar(at, 100 * rows["value"], yerr=ends, **bound)
+            axes.errorbar(
+                at,
+                100 * rows["value"],
+                yerr=ends,
+                fmt="none",
+                ecolor="black",
+                capsize=2,
+                linewidth=0.9,
+            )
             if "paper" in rows:
                 axes.plot(at, 100 * rows["paper"], "D", color=PAPER, fillstyle="none")
         axes.set_xticks(range(len(own)), own, fontsize=8)
@@ -332,8 +352,9 @@ def stacked(
                           label=MEANINGS.get(part, part))  # fmt: skip
         counts = [str(n) if wide > 2 else "" for n, wide in zip(table[part], percent, strict=True)]
         dark = np.dot(to_rgb(colour), (0.3, 0.59, 0.11)) < 0.5
-        ink: dict[str, Any] = dict(color="white" if dark else "black", fontsize=7.5)
-        axes.bar_label(drawn, counts, label_type="center", **ink)
+        axes.bar_label(
+            drawn, counts, label_type="center", color="white" if dark else "black", fontsize=7.5
+        )
         start += percent
     axes.set_yticks(range(len(labels)), labels, fontsize=8)
     for i, tick in enumerate(axes.get_yticklabels()):
@@ -401,8 +422,9 @@ def sheet(
     axes.set_axis_off()
     for i, (label, row) in enumerate(rows.items()):
         left, top = i // per_column * width, i % per_column * height + 0.03
-        middle: dict[str, Any] = dict(ha="right", va="center", fontsize=9)
-        axes.text(left + label_in - 0.08, top + side_in / 2, label, **middle)
+        axes.text(
+            left + label_in - 0.08, top + side_in / 2, label, ha="right", va="center", fontsize=9
+        )
         for j, tile in enumerate(row):
             x, y = left + label_in + (j + 0.5) * side_in, top + side_in / 2
             half = (side_in - 0.06) / 2
@@ -411,10 +433,14 @@ def sheet(
             axes.imshow(tile.picture, extent=extent, aspect="auto", interpolation="antialiased")
             if tile.edge:
                 corner = (x - half, y - half)
-                frame: dict[str, Any] = dict(fill=False, edgecolor=tile.edge, linewidth=1.8)
-                axes.add_patch(Rectangle(corner, 2 * half, 2 * half, **frame))
-            below: dict[str, Any] = dict(ha="center", va="top", fontsize=title_pt, color=TEXT)
-            axes.text(x, top + side_in, tile.title, **below)
+                axes.add_patch(
+                    Rectangle(
+                        corner, 2 * half, 2 * half, fill=False, edgecolor=tile.edge, linewidth=1.8
+                    )
+                )
+            axes.text(
+                x, top + side_in, tile.title, ha="center", va="top", fontsize=title_pt, color=TEXT
+            )
     axes.set(xlim=(0, columns * width), ylim=(per_column * height, 0))
     return figure
 

@@ -23,6 +23,7 @@ from vap_core.memory import load_bank
 from vap_core.perception.stacks import checksums, load_own
 from vap_core.policies.lerobot.datasets import Copy, Recorded, open_dataset
 from vap_core.study import store
+from vap_core.study.cases import true_runs
 from vap_core.study.measurement import Row
 from vap_core.study.table import printed
 
@@ -180,26 +181,14 @@ def _inspect_episode(
     for camera, seen in visible.items():
         grounding = first.groundings[camera][0]
         chosen = grounding.chosen
-        stretches = _stretches(seen) if grounding.winner is not None else []
+        absent = [not here for here in seen] if grounding.winner is not None else []
+        stretches = [stop - start for start, stop in true_runs(absent)]
         row: Row = {"episode": episode, "camera": camera, "frames": len(seen)}
         row |= {"grounded": grounding.winner is not None, "margin": float(grounding.ballot.margin)}
         row["likeness"] = 0.0 if chosen is None else float(grounding.likeness[chosen])
         row |= {"tracked": sum(seen), "losses": len(stretches)}
         reports.append({**row, "longest": max(stretches, default=0)})
     return reports
-
-
-def _stretches(seen: Sequence[bool]) -> list[int]:
-    """The lengths of the stretches without the object."""
-    lengths: list[int] = []
-    before = True
-    for here in seen:
-        if not here:
-            if before:
-                lengths.append(0)
-            lengths[-1] += 1
-        before = here
-    return lengths
 
 
 def _memory_digest(bank: Mapping[str, PersonalObject]) -> str:

@@ -8,7 +8,7 @@ tokens whose nearest row of the second, by cosine, is their own.
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -158,14 +158,15 @@ def spaces(vlm: Path | None, policies: Sequence[Path], suite: str = "") -> "pd.D
         found = {WHOLE: compare(ours, theirs)}
         names = _suites_of(policy, suite)
         n = found[WHOLE].tokens
+        said = [task.instruction for name in names for task in BENCHMARKS[name].tasks]
         label = f"words of {names[0]}" if len(names) == 1 else "words of all suites"
-        for group, tokens in token_groups((policy, model), _instructions(names)).items():
+        for group, tokens in token_groups((policy, model), said).items():
             shared = tokens[tokens < n]
             if len(shared):
                 name = label if group == "words" else group
                 found[name] = compare(ours, theirs, shared)
         for group, comparison in found.items():
-            about: dict[str, Any] = {"vlm": model.name, "policy": policy.name, "group": group}
+            about = {"vlm": model.name, "policy": policy.name, "group": group}
             rows.append({**about, "features": ours.shape[1], **asdict(comparison)})
     return pd.DataFrame(rows)
 
@@ -181,27 +182,30 @@ def paper_spaces() -> "pd.DataFrame":
     table = table[table.table == "embedding_comparison"]
     rows = []
     for policy, part in table.groupby("row", sort=False):
-        values: dict[str, Any] = dict(zip(part.metric, part.value.astype(float), strict=True))
-        row: dict[str, Any] = {"policy": policy, "group": WHOLE}
-        row["tokens"] = int(values["vocabulary"])
-        for name, metric in MEASURES.items():
-            row[name] = values[metric]
-        rows.append(row)
+        values = dict(zip(part.metric, part.value.astype(float), strict=True))
+        row = {"policy": policy, "group": WHOLE, "tokens": int(values["vocabulary"])}
+        rows.append(row | {name: values[metric] for name, metric in MEASURES.items()})
     return pd.DataFrame(rows)
 
 
 def report(table: "pd.DataFrame") -> str:
     """The table as text, with the paper's below it. Raises: BadOutput, as `paper.ledger`."""
-    rows = [HEADER]
-    for row in table.to_dict("records"):
-        rows.append(_cells(row))
-    for row in paper_spaces().to_dict("records"):
-        rows.append(_cells({**row, "policy": f"paper: {row['policy']}"}))
+    import pandas as pd
+
+    theirs = paper_spaces()
+    both = pd.concat([table, theirs.assign(policy="paper: " + theirs["policy"])], ignore_index=True)
+    cosines = zip(both["cosine_mean"], both["cosine_std"], strict=True)
+    shown = both[["policy", "group", "tokens"]].set_axis(HEADER[:3], axis=1)
+    shown["cosine"] = [f"{mean:.6f} ± {deviation:.6f}" for mean, deviation in cosines]
+    numbers = both[["cosine_min", "cka", "cka_debiased", "nearest"]].map("{:.4f}".format)
+    shown[HEADER[4:]] = numbers.replace("nan", "-")
     left_out = table[table.without_direction > 0]
-    note = f"{NOTE} {_compared(table)}"
+    policies = table.groupby("vlm", sort=False)["policy"].unique().items()
+    compared = "; ".join(f"{', '.join(names)} with {vlm}" for vlm, names in policies)
+    note = f"{NOTE} Compared: {compared}."
     if len(left_out):
         note += f" Without rows of zeros, at most {left_out.without_direction.max()} a group."
-    return f"{printed(rows)}\n\n{note}"
+    return f"{printed(shown)}\n\n{note}"
 
 
 def check_output(path: Path) -> None:
@@ -228,37 +232,8 @@ def keep(table: "pd.DataFrame", path: Path) -> None:
         write_atomic(path, data)
 
 
-def _compared(table: "pd.DataFrame") -> str:
-    """Which policies stand beside which model."""
-    parts = []
-    for vlm, part in table.groupby("vlm", sort=False):
-        parts.append(f"{', '.join(part.policy.unique())} with {vlm}")
-    return f"Compared: {'; '.join(parts)}."
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    cells = [str(row["policy"]), str(row["group"]), str(row["tokens"])]
-    cells.append(f"{row['cosine_mean']:.6f} ± {row['cosine_std']:.6f}")
-    for name in ("cosine_min", "cka", "cka_debiased", "nearest"):
-        number = row.get(name, float("nan"))
-        cells.append("-" if number != number else f"{number:.4f}")
-    return cells
-
-
 def _suites_of(policy: Path, suite: str) -> list[str]:
-    if suite:
-        if suite not in BENCHMARKS:
-            raise BadPolicy(f"embeddings: no suite {suite!r}; known: {', '.join(BENCHMARKS)}.")
-        return [suite]
-    for name in BENCHMARKS:
-        if name in policy.name:
-            return [name]
-    return list(BENCHMARKS)
-
-
-def _instructions(names: Sequence[str]) -> list[str]:
-    texts = []
-    for name in names:
-        for task in BENCHMARKS[name].tasks:
-            texts.append(task.instruction)
-    return texts
+    if suite and suite not in BENCHMARKS:
+        raise BadPolicy(f"embeddings: no suite {suite!r}; known: {', '.join(BENCHMARKS)}.")
+    named = [name for name in BENCHMARKS if name in policy.name][:1]
+    return [suite] if suite else named or list(BENCHMARKS)

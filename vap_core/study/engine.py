@@ -100,10 +100,8 @@ def unknown_words_notes(study: Study) -> list[str]:
             continue
         folder = locate(checkpoint)
         known, _ = vocabulary_of(folder) or ((), None)
-        said = []
-        for of_task, task in study.tasks:
-            if of_task == suite:
-                said += [row.instruction for row in study.rows(suite, task)]
+        tasks = [task for task in study.tasks if task[0] == suite]
+        said = [row.instruction for task in tasks for row in study.rows(*task)]
         words = unknown_words(known, said)
         if words:
             lines.append(
@@ -116,23 +114,18 @@ def unknown_words_notes(study: Study) -> list[str]:
 
 def worker_modules(policy: str) -> tuple[str, ...]:
     """What a worker of a study with this policy imports first."""
-    modules: tuple[str, ...] = (
+    modules = [
         "vap_core.study.engine",
         "vap_core.rollout.loop",
         "vap_core.recording.recorder",
         "onnxruntime",
         "scipy.special",
-    )
-    if policy in POLICIES:
-        return modules
-    modules = (
-        *modules,
-        "vap_core.policies.lerobot.adapter",
-        "lerobot.policies",
-    )
-    if Path(policy).name.startswith(MINI):
-        return (*modules, "vap_core.policies.mini_pi0.processor_mini_pi0")
-    return modules
+    ]
+    if policy not in POLICIES:
+        modules += ["vap_core.policies.lerobot.adapter", "lerobot.policies"]
+        if Path(policy).name.startswith(MINI):
+            modules.append("vap_core.policies.mini_pi0.processor_mini_pi0")
+    return tuple(modules)
 
 
 def start_server(policy: str, folder: Path) -> None:
@@ -146,10 +139,8 @@ def start_server(policy: str, folder: Path) -> None:
 
 def probable_policy(suite_names: Sequence[str]) -> str:
     """The default policy of suites, as far as their names alone say it; else ""."""
-    for name in suite_names:
-        if name != "all" and not shipped_checkpoint(name).is_dir():
-            return ""
-    return MINI
+    named = set(suite_names) - {"all"}
+    return MINI if all(shipped_checkpoint(name).is_dir() for name in named) else ""
 
 
 BATCH = 5
@@ -206,9 +197,7 @@ def run_job(job: Job) -> Rows:
     job.study.open_suites()
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
     require_same_weights(job.study, job.rows[0].suite, job.folder)
-    begin = None
-    if _records(job):
-        begin = _recorders(job)
+    begin = _recorders(job) if _records(job) else None
     if job.attention and not getattr(trial.policy, "attends", False):
         raise BadStudy(
             f"engine: {trial.policy.label} gives no attention maps, as pi0, pi0.5, mini-pi0 and "
@@ -290,9 +279,7 @@ def _recorders(job: Job) -> Callable[[EpisodeHeader], "Recorder | DeferredRecord
     folder = job.folder / "recordings"
     with writing(folder, "engine"):
         folder.mkdir(parents=True, exist_ok=True)
-    keys = {}
-    for row, key in zip(job.rows, job.keys, strict=True):
-        keys[row.key, row.seed] = key
+    keys = {(row.key, row.seed): key for row, key in zip(job.rows, job.keys, strict=True)}
 
     def begin(header: EpisodeHeader) -> "Recorder | DeferredRecorder":
         row = header.row
@@ -389,8 +376,9 @@ def run(
                     file=sys.stderr,
                 )
 
-            more: dict[str, Any] = dict(retries=retries, alone=alone, note=note)
-            work_off(missing, run_job, keep, executor, workers, **more)
+            work_off(
+                missing, run_job, keep, executor, workers, retries=retries, alone=alone, note=note
+            )
         store.compact(folder)
     table = store.read(folder)
     errors = table[table["outcome"] == "error"]
@@ -459,7 +447,7 @@ def missing_jobs(
             recorded = spread_evenly(rows, record) if isinstance(record, int) else []
             chosen = frozenset(key for _, key in recorded)
             for (_, attempt), group in _missing_groups(rows, attempts, retries).items():
-                record_now: Record = record if attempt == 1 else "all"
+                record_now = record if attempt == 1 else "all"
                 first = 0
                 while first < len(group):
                     size = 1 if given < short else BATCH
@@ -519,15 +507,14 @@ def _show_progress(
 
     `counted` are the keys of the episodes that `counts` has: a second attempt is none more.
     """
-    count = counts.setdefault(method, Counter())
-    for row in rows:
-        count["success"] += row["success"]
     fresh = set(map(store.key_of, rows)) - counted
     counted |= fresh
-    count["n"] += len(fresh)
+    won = sum(row["success"] for row in rows)
+    counts.setdefault(method, Counter()).update(success=won, n=len(fresh))
     bar.update(len(fresh))
-    rates = []
-    for method, count in sorted(counts.items()):
-        if count["n"]:
-            rates.append(f"{method} {100 * count['success'] / count['n']:.0f} % of {count['n']}")
+    rates = [
+        f"{name} {100 * count['success'] / count['n']:.0f} % of {count['n']}"
+        for name, count in sorted(counts.items())
+        if count["n"]
+    ]
     bar.set_postfix_str(", ".join(rates))

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -141,37 +141,6 @@ def write_provenance(png: Path, study: Study) -> None:
         ) from error
 
 
-def read_provenance(png: Path) -> dict[str, Any]:
-    """What `write_provenance` kept in a PNG; empty for any other picture."""
-    from PIL import Image
-
-    with Image.open(png) as picture:
-        text = picture.info.get(CHUNK)
-    if text is None:
-        return {}
-    return dict(json.loads(text))
-
-
-def stale(png: Path) -> str:
-    """How what a still picture shows differs from what is here now, "" where it does not.
-
-    Nothing is executed that the picture names.
-
-    Raises: BadOutput for a picture without provenance.
-    """
-    about = read_provenance(png)
-    if not about:
-        raise BadOutput(f"stale: {png} does not say what it shows; take the picture again.")
-    if about["recorder"] != recorder_digest():
-        return "the recorder shows episodes otherwise now"
-    settings = {name: value for name, value in about["study"].items() if name != EXECUTED}
-    settings["tasks"] = tuple(tuple(task) for task in settings["tasks"])
-    settings["methods"] = tuple(settings["methods"])
-    if about["configuration"] != store.digest(Study(**settings).configuration()):
-        return "weights, episode lists or objects are others now"
-    return ""
-
-
 @cache
 def recorder_digest() -> str:
     """A digest of the code that decides what a recording shows, its colours and vote included.
@@ -248,23 +217,22 @@ def breakdown(table: "pd.DataFrame") -> "pd.DataFrame":
     Raises: BadOutput when the table is older than the diagnosis.
     """
     episodes = _by_policy(diagnosed(table))
-    if "case_confidence" not in episodes:  # no episode failed
-        episodes = episodes.assign(case_confidence=float("nan"))
     failed = episodes["outcome"].eq("failure")
-    flat = episodes[BY].assign(n=1, failed=failed.astype(int))
+    flags = {"failed": failed}
     for case, sub_cases in CASES.items():
         # Older versions gave some errors a case, too.
-        of_case = failed & episodes["case"].eq(case)
-        flat[case] = of_case.astype(int)
+        flags[case] = failed & episodes["case"].eq(case)
         for sub_case in sub_cases:
-            flat[f"{case}: {sub_case}"] = (of_case & episodes["sub_case"].eq(sub_case)).astype(int)
-    numbers = episodes.loc[failed, SUBGOAL].dropna() if SUBGOAL in episodes else ()
-    for number in sorted({int(number) for number in numbers}):
-        flat[f"sub-goal {number}"] = (failed & episodes[SUBGOAL].eq(number)).astype(int)
-    counts = flat.groupby(BY, sort=False).sum().reset_index()
-    with_case = episodes[failed & episodes["case"].ne("")].groupby(BY, sort=False)
-    confidence = with_case["case_confidence"].mean().rename("mean_confidence").reset_index()
-    return counts.merge(confidence, on=BY, how="left")
+            flags[f"{case}: {sub_case}"] = flags[case] & episodes["sub_case"].eq(sub_case)
+    if SUBGOAL in episodes:
+        for number in sorted({int(number) for number in episodes.loc[failed, SUBGOAL].dropna()}):
+            flags[f"sub-goal {number}"] = failed & episodes[SUBGOAL].eq(number)
+    flat = episodes[BY].assign(n=1, **{name: flag.astype(int) for name, flag in flags.items()})
+    with_case = failed & episodes["case"].ne("")  # no failure: there may be no such column
+    confidence = episodes.reindex(columns=["case_confidence"])["case_confidence"].where(with_case)
+    counts = flat.groupby(BY, sort=False).sum()
+    means = flat[BY].assign(mean_confidence=confidence).groupby(BY, sort=False).mean()
+    return counts.join(means).reset_index()
 
 
 def _by_policy(episodes: "pd.DataFrame") -> "pd.DataFrame":
@@ -304,10 +272,8 @@ def sub_cases_text(counts: "pd.DataFrame") -> str:
     """How often each sub-case occurred, most frequent first, one line per suite and method."""
     lines = []
     for line in counts.to_dict("records"):
-        occurred = sorted(
-            ((int(line[name]), name) for name in SUB_CASES if line[name]), reverse=True
-        )
-        text = ", ".join(f"{n} x {name}" for n, name in occurred)
+        occurred = sorted(((int(line[name]), name) for name in SUB_CASES), reverse=True)
+        text = ", ".join(f"{n} x {name}" for n, name in occurred if n)
         lines.append(f"{line['suite']} {line['method']}: {text or 'no failure'}")
     return "\n".join(lines)
 
@@ -399,29 +365,19 @@ def list_failures(
     manifests, once = _read_once(sources)
     check_diagnosed(once)
     older = once[once["case"].isna()]  # episodes of runs that are older than the diagnosis
-    known = diagnosed(once).reset_index(drop=True)
-    all_episodes = with_corrections(_with_folders(known))
+    all_episodes = with_corrections(_with_folders(diagnosed(once).reset_index(drop=True)))
     selected = all_episodes
     for column, wanted in (("suite", suite), ("task", task), ("method", method)):
         selected = _select(selected, column, wanted)
-        if wanted is not None:
-            older = older[older[column] == wanted]
+        older = older if wanted is None else older[older[column] == wanted]
     table = selected[selected["outcome"].eq("failure")]
     table = _select(table, "case", f"case {case}" if str(case).isdigit() else case)
     table = _select(table, "sub_case", sub_case)
     if where is not None:
         table = rows_matching(table, where)
-    notes: tuple[str, ...] = ()
-    if len(older):
-        n_failures = int(older["outcome"].eq("failure").sum())
-        notes = (f"{older_text(len(older))}; {n_failures} of them failed.",)
-    return Failures(
-        manifests=manifests,
-        all_episodes=all_episodes,
-        episodes=selected,
-        table=table.reset_index(drop=True),
-        notes=notes,
-    )
+    n_failures = int(older["outcome"].eq("failure").sum())
+    notes = (f"{older_text(len(older))}; {n_failures} of them failed.",) if len(older) else ()
+    return Failures(manifests, all_episodes, selected, table.reset_index(drop=True), notes)
 
 
 def failures_text(failures: Failures, limit: int = 20) -> str:
@@ -466,26 +422,23 @@ def _read_once(sources: Sequence[Path]) -> "tuple[dict[str, dict[str, Any]], pd.
     """
     import pandas as pd
 
-    manifests = {}
-    tables = []
+    manifests, settings, tables = {}, {}, []
     for source in dict.fromkeys(sources):
         for manifest, episodes in read_runs(source):
-            manifests[manifest["digest"]] = manifest
+            digest, study = manifest["digest"], manifest["configuration"]
+            manifests[digest] = manifest
+            # Episodes of other scenes or another perception stack are others.
+            settings[digest] = f"{scene_of(study)}, {study.get('stack', '')}"
             if not episodes.empty:
                 check_diagnosed(episodes)
-                named = episodes.assign(configuration=manifest["digest"], source=str(source))
-                tables.append(named)
+                tables.append(episodes.assign(configuration=digest, source=str(source)))
     if not tables:
         raise BadOutput(
             f"diagnose: {' and '.join(map(str, sources))} hold no finished episode; run eval first."
         )
     whole = pd.concat(tables, ignore_index=True).sort_values("case", key=pd.isna, kind="stable")
-    settings = {}  # episodes of other scenes or another perception stack are others
-    for digest, manifest in manifests.items():
-        study = manifest["configuration"]
-        settings[digest] = f"{scene_of(study)}, {study.get('stack', '')}"
-    names = [name for name in (*KEY, "policy") if name in whole]
-    keys = whole[names].assign(setting=whole["configuration"].map(settings))
+    keys = whole[[name for name in (*KEY, "policy") if name in whole]]
+    keys = keys.assign(setting=whole["configuration"].map(settings))
     return manifests, whole[~keys.duplicated()].reset_index(drop=True)
 
 
@@ -558,24 +511,17 @@ def side_by_side_recording(failures: Failures, number: int, method: str) -> Path
     same = same[same["configuration"].map(scenes) == scenes[row["configuration"]]]
     for name in (*ROW_KEY, "policy"):
         same = same[same[name] == row[name]]
-    if method == row["method"]:
-        others = sorted(set(same["method"]) - {method})
-        raise BadStudy(
-            f"diagnose: {method!r} is that failure's own method; "
-            f"there is {', '.join(others) or 'no other'}."
-        )
+    others = sorted(set(same["method"]) - {method})
     other = same[same["method"] == method]
-    if other.empty:
-        raise BadStudy(
-            f"diagnose: {method!r} did not run this episode here; there is "
-            f"{', '.join(sorted(same['method']))}."
-        )
-    paths = {}
-    for each in (row, other.iloc[0].to_dict()):
-        paths[each["method"]] = _recording_of_row(failures, each)
-    stem = paths[row["method"]].stem
-    out = Path(row["folder"]) / "together" / f"{stem}-{method}.rrd"
-    _unlink(out)
+    if method == row["method"] or other.empty:
+        flaw = "is that failure's own method"
+        flaw = flaw if method == row["method"] else "did not run this episode here"
+        raise BadStudy(f"diagnose: {method!r} {flaw}; there is {', '.join(others) or 'no other'}.")
+    both = (row, other.iloc[0].to_dict())
+    paths = {each["method"]: _recording_of_row(failures, each) for each in both}
+    out = Path(row["folder"]) / "together" / f"{paths[row['method']].stem}-{method}.rrd"
+    with writing(out.parent, "diagnose", "copy the run to where you may write"):
+        out.unlink(missing_ok=True)
     combine_recordings(paths, out)
     return out
 
@@ -708,12 +654,6 @@ def _keep_beside(path: Path) -> Path:
                 return kept
 
 
-def _unlink(path: Path) -> None:
-    """Remove what is made again. Raises: BadOutput."""
-    with writing(path.parent, "diagnose", "copy the run to where you may write"):
-        path.unlink(missing_ok=True)
-
-
 def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     """The study of a run, of one task and method alone; its policy as it is named here today.
 
@@ -722,23 +662,18 @@ def study_of(manifest: Mapping[str, Any], row: Mapping[str, Any]) -> Study:
     Raises: BadStudy when the suite's episode list has changed since; as `Study`, when something
         that the manifest names is not here today.
     """
-    configuration = manifest["configuration"]
-    suite = row["suite"]
+    configuration, suite = manifest["configuration"], row["suite"]
     listed = configuration.get("lists", {}).get(suite)
     if listed is not None and suites.changed_lists({suite: listed}):
         raise BadStudy(
             f"diagnose: the list of {suite} has changed since this was run; use the version that "
             "ran it, or run eval again."
         )
-    settings = {}
-    for field in fields(Study):
-        if field.name in configuration and field.name != EXECUTED:
-            settings[field.name] = configuration[field.name]
-    settings["tasks"] = ((suite, row["task"]),)
-    settings["methods"] = (row["method"],)
-    label = str(row.get("policy", ""))
-    settings["policy"] = policy_today(settings["policy"], label, suite)
-    return replace(Study(**settings), audit=False)
+    names = {field.name for field in fields(Study)} - {EXECUTED}
+    settings = {name: value for name, value in configuration.items() if name in names}
+    settings |= {"tasks": ((suite, row["task"]),), "methods": (row["method"],), "audit": False}
+    settings["policy"] = policy_today(settings["policy"], str(row.get("policy", "")), suite)
+    return Study(**settings)
 
 
 def listed_row(study: Study, row: Mapping[str, Any]) -> EpisodeRow:

@@ -47,8 +47,7 @@ class FilledBox:
         if corners is None:
             return out
         (x0, y0), (x1, y1) = corners
-        inside = out[y0:y1, x0:x1]
-        mixed = (1.0 - self.alpha) * inside + self.alpha * np.asarray(colour.rgb)
+        mixed = (1.0 - self.alpha) * out[y0:y1, x0:x1] + self.alpha * np.asarray(colour.rgb)
         out[y0:y1, x0:x1] = np.rint(mixed).astype(np.uint8)
         return out
 

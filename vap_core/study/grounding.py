@@ -31,6 +31,7 @@ from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import load_own
+from vap_core.study.cases import true_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -157,9 +158,7 @@ def to_json(found: Found) -> dict[str, Any]:
     `instruction` is the rewritten one, `said` the given one. Boxes are pixels of a picture of
     `size`, width and height.
     """
-    targets = []
-    for grounding in found.attended.groundings[CAMERA]:
-        targets.append(_grounding_to_json(grounding))
+    targets = [_grounding_to_json(grounding) for grounding in found.attended.groundings[CAMERA]]
     return {
         **targets[0],
         "instruction": found.attended.text,
@@ -278,9 +277,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box
         cosine = grounding.similarity[i].mean()
-        points = ""
-        if candidates.verified is not None:
-            points = f"  points {candidates.verified[i]}"
+        points = f"  points {candidates.verified[i]}" if candidates.verified is not None else ""
         lines.append(
             f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
             f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}{points}"
@@ -298,8 +295,8 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         return lines
     tie = ", tie broken by mean cosine" if ballot.tied[winner] else ""
     measure = "cosine"
-    if candidates.prior is not None or candidates.proof is not None:
-        measure = "score, which is the cosine and what phrase and points add"
+    if candidates.proof is not None:
+        measure = "score, which is the cosine and what points add"
     lines.append(
         f"winner #{winner}, margin {ballot.margin:.2f} of the votes{tie}, "
         f"{ballot.cosine_margin:.3f} in {measure}"
@@ -478,7 +475,9 @@ def _follow(
             visible.append(track.mask is not None)
             recorder.add(ClipStep(number, number / hz, rgb, prompted, track))
             film.add(prompted)
-    lost = () if grounded is None else _spans(visible, grounded)
+    first_seen = len(visible) if grounded is None else grounded
+    absent = true_runs([number >= first_seen and not seen for number, seen in enumerate(visible)])
+    lost = tuple((start, stop - 1) for start, stop in absent)
     return ClipSummary(len(visible), grounded, sum(visible), lost, text, obj.name, notes)
 
 
@@ -506,16 +505,3 @@ def _of_one_size(photos: Sequence[Path]) -> Iterator[Rgb]:
                 "frames have one size. Name single pictures one by one."
             )
         yield rgb
-
-
-def _spans(visible: Sequence[bool], grounded: int) -> tuple[tuple[int, int], ...]:
-    """First and last frame of every stretch without the object, once it was grounded."""
-    spans: list[tuple[int, int]] = []
-    for number in range(grounded, len(visible)):
-        if visible[number]:
-            continue
-        if spans and spans[-1][1] == number - 1:
-            spans[-1] = (spans[-1][0], number)
-        else:
-            spans.append((number, number))
-    return tuple(spans)

@@ -34,10 +34,11 @@ def write_states(folder: Path, episodes: Sequence[Episode]) -> None:
 
     Raises: BadOutput when the disk is full.
     """
-    rows = []
-    for episode in episodes:
-        if episode.frames and not episode.subgoals and episode.outcome.status != "error":
-            rows.append(_to_row(episode))
+    rows = [
+        _to_row(episode)
+        for episode in episodes
+        if episode.frames and not episode.subgoals and episode.outcome.status != "error"
+    ]
     if rows:
         write_part(folder, "traces", rows, caller="traces")
 
@@ -61,24 +62,17 @@ def read_states(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
 
 def _to_row(episode: Episode) -> dict[str, Any]:
     names = [place.model for place in episode.header.row.placements]
-    poses = []
-    touched = []
-    pressed = []
-    contacts = []
-    for frame in episode.frames:
-        truth = frame.truth
-        for name in names:
-            poses.append(truth.objects_world[name])
-        touched.append(list(truth.touched))
-        pressed.append(_pressed_to_text(truth.pressed_s))
-        contacts.append(_contacts_to_text(truth.contacts))
+    truths = [frame.truth for frame in episode.frames]
     return {
         **dict(zip(KEY, episode.key, strict=True)),
         "objects": names,
-        "poses": np.concatenate(poses),
-        "touched": touched,
-        "pressed": pressed,
-        "contacts": contacts,
+        "poses": np.concatenate([truth.objects_world[name] for truth in truths for name in names]),
+        "touched": [list(truth.touched) for truth in truths],
+        "pressed": [[f"{n}={s!r}" for n, s in truth.pressed_s.items()] for truth in truths],
+        "contacts": [
+            [f"{name}={other}" for name in sorted(met) for other in sorted(met[name])]
+            for met in (truth.contacts for truth in truths)
+        ],
     }
 
 
@@ -86,61 +80,29 @@ def _truths(row: Mapping[str, Any]) -> list[Truth]:
     names = list(row["objects"])
     poses = np.asarray(row["poses"], np.float64).reshape(-1, len(names), 7)
     truths = []
-    for step, touched, pressed, contacts in zip(
+    for step, touched, *texts in zip(
         poses, row["touched"], row["pressed"], row["contacts"], strict=True
     ):
+        pressed, contacts = ([text.rsplit("=", 1) for text in each] for each in texts)
+        met = {name: frozenset(o for n, o in contacts if n == name) for name, _ in contacts}
         truth = Truth(
             objects_world=dict(zip(names, step, strict=True)),
             links_world={},
             touched=tuple(touched),
-            pressed_s=_pressed_from_text(pressed.tolist()),
-            contacts=_contacts_from_text(contacts.tolist()),
+            pressed_s={name: float(seconds) for name, seconds in pressed},
+            contacts=met,
         )
         truths.append(truth)
     return truths
 
 
-def _pressed_to_text(pressed_s: Mapping[str, float]) -> list[str]:
-    texts = []
-    for name, seconds in pressed_s.items():
-        texts.append(f"{name}={seconds!r}")
-    return texts
-
-
-def _pressed_from_text(texts: Sequence[str]) -> dict[str, float]:
-    pressed_s = {}
-    for text in texts:
-        name, seconds = text.rsplit("=", 1)
-        pressed_s[name] = float(seconds)
-    return pressed_s
-
-
-def _contacts_to_text(contacts: Mapping[str, frozenset[str]]) -> list[str]:
-    texts = []
-    for name in sorted(contacts):
-        for other in sorted(contacts[name]):
-            texts.append(f"{name}={other}")
-    return texts
-
-
-def _contacts_from_text(texts: Sequence[str]) -> dict[str, frozenset[str]]:
-    partners: dict[str, set[str]] = {}
-    for text in texts:
-        name, other = text.rsplit("=", 1)
-        partners.setdefault(name, set()).add(other)
-    contacts = {}
-    for name, others in partners.items():
-        contacts[name] = frozenset(others)
-    return contacts
-
-
 def write_audit(folder: Path, episodes: Sequence[Episode]) -> None:
     """Add the calls of some finished episodes to a run. Raises: BadOutput."""
-    lines = []
-    for episode in episodes:
-        key = dict(zip(KEY, episode.key, strict=True))
-        for call in episode.consumed:
-            lines.append({**key, **asdict(call), "sound": call.sound})
+    lines = [
+        {**dict(zip(KEY, episode.key, strict=True)), **asdict(call), "sound": call.sound}
+        for episode in episodes
+        for call in episode.consumed
+    ]
     if lines:
         write_part(folder, "audit", lines, caller="audit")
 
@@ -198,10 +160,11 @@ def hidden_columns(episode: Episode, occlusion: Occlusion | None) -> dict[str, A
     """
     if occlusion is None or not episode.frames:
         return {}
-    later = []
-    for frame in episode.frames:
-        if frame.frame_index >= occlusion.start + occlusion.frames:
-            later.append(frame.coverage)
+    later = [
+        frame.coverage
+        for frame in episode.frames
+        if frame.frame_index >= occlusion.start + occlusion.frames
+    ]
     return {
         "hidden_s": occlusion.frames / episode.header.hz,
         "track_kept": is_track_kept(later, episode.header.row.target),
@@ -214,14 +177,11 @@ def is_track_kept(later: Sequence[Sequence[MaskCoverage]], target: str) -> bool 
     `later` are the steps after that. Soon is the first or second prompted step in which the target
     is visible; None where it never is, for the episode is over or the target out of view.
     """
-    visible = []
-    for coverage in later:
-        showing = [view for view in coverage if view.pixels >= THRESHOLDS.pixels]
-        if showing:
-            visible.append(showing)
+    views = ([view for view in step if view.pixels >= THRESHOLDS.pixels] for step in later)
+    visible = [showing for showing in views if showing][:CALLS]
     if not visible:
         return None
-    return any(all(view.object == target for view in views) for views in visible[:CALLS])
+    return any(all(view.object == target for view in showing) for showing in visible)
 
 
 def hiding_lines(episodes: "pd.DataFrame") -> list[str]:
@@ -292,11 +252,9 @@ def _switch(episode: Episode) -> tuple[int, str] | None:
 
     A switch in the last frame is none: no action follows it.
     """
-    for i, frame in enumerate(episode.frames[:-1]):
-        for event in frame.events:
-            if event.text.startswith(SWITCHED):
-                return i, event.text.removeprefix(SWITCHED)
-    return None
+    texts = ((i, e.text) for i, frame in enumerate(episode.frames[:-1]) for e in frame.events)
+    found = ((i, text.removeprefix(SWITCHED)) for i, text in texts if text.startswith(SWITCHED))
+    return next(found, None)
 
 
 def _away_m(robot: Robot, frame: Frame, name: str) -> float:

@@ -91,8 +91,13 @@ def measure(
             return [part for part in of_kind if not part.path.exists()]
 
         done = sum(part.path.exists() for part in parts)
-        look = dict(unit="job", desc=asked.caller.removeprefix("measure "), disable=not progress)
-        with tqdm(total=len(parts), initial=done, **look) as bar:
+        with tqdm(
+            total=len(parts),
+            initial=done,
+            unit="job",
+            desc=asked.caller.removeprefix("measure "),
+            disable=not progress,
+        ) as bar:
 
             def keep(part: Part, tables: Tables) -> None:
                 store.write_json_part(part.path, tables, asked.caller)

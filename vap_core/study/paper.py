@@ -191,9 +191,7 @@ def real_arm() -> str:
     facts = facts[(facts["table"] == REAL) & facts["row"].isin(["pi0.5", "pi0.5 + VAP"])]
     parts = []
     for column, part in facts.groupby("column", sort=False):
-        rates = []
-        for line in part.itertuples():
-            rates.append(f"{line.row} {line.value:.1f}")
+        rates = [f"{line.row} {line.value:.1f}" for line in part.itertuples()]
         parts.append(f"{column}: {', '.join(rates)}")
     return f"The paper's real arm, SR % as means of four tasks each: {'; '.join(parts)}."
 

@@ -65,7 +65,7 @@ class Paraphrase:
 @cache
 def read_vocabulary() -> dict[str, Any]:
     """The suites' objects, what they are for and look like, and other things."""
-    vocabulary: dict[str, Any] = json.loads((FOLDER / "objects.json").read_text("utf-8"))
+    vocabulary = json.loads((FOLDER / "objects.json").read_text("utf-8"))
     return vocabulary
 
 
@@ -98,8 +98,7 @@ def _of_family(suite: str, family: Mapping[str, str], number: int) -> Iterator[P
         key = keys[i % len(keys)]
         action = actions[(i // len(keys) + i + number) % len(actions)]
         second = family["memory"] == "double" and (i // len(keys) + i + number) % 2 == 1
-        words = _words(key, family, second, i + number) | action
-        marked = _fill(family["text"], words)
+        marked = _fill(family["text"], _words(key, family, second, i + number) | action)
         if marked in said:
             continue
         said.add(marked)

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import combinations
+from itertools import batched, combinations
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
@@ -142,7 +142,7 @@ def read_photo_set(folder: Path) -> PhotoSet:
 
 def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], ...]]:
     """The photos of every object, with their boxes."""
-    root = folder / "references"
+    root, table = folder / "references", folder / BOXES_CSV
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     if not folders and (folder / MASKS).is_dir():
         return {}
@@ -150,21 +150,21 @@ def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], .
         raise _wrong(
             f"{root} holds no folder of photos; put each object's photos into references/OBJECT."
         )
-    boxes: dict[str, Box | None] = {}
-    table = folder / BOXES_CSV
-    for line, row in _read_csv(table, ("photo", *BOX)) if table.exists() else ():
-        boxes[row["photo"]] = _parse_box(row, f"{table} line {line}")
+    boxes = {
+        row["photo"]: _parse_box(row, f"{table} line {line}")
+        for line, row in (_read_csv(table, ("photo", *BOX)) if table.exists() else ())
+    }
     objects = {}
     for path in folders:
         check_object_folder(path)
-        photos = [
-            (photo, boxes.pop(f"{path.name}/{photo.name}", None)) for photo in photos_in(path)
-        ]
+        photos = photos_in(path)
         if not photos:
             raise _wrong(
                 f"{path} holds no picture; put photos of the object there, or remove the folder."
             )
-        objects[path.name] = tuple(photos)
+        objects[path.name] = tuple(
+            (photo, boxes.pop(f"{path.name}/{photo.name}", None)) for photo in photos
+        )
     if boxes:
         raise _wrong(
             f"{table} names {sorted(boxes)[0]!r}, which is not there; name photos as OBJECT/FILE."
@@ -181,14 +181,14 @@ def check_object_folder(path: Path, caller: str = "measure photos") -> None:
 def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
     """Every scene with its rows of scenes.csv."""
     root, table = folder / "scenes", folder / SCENES_CSV
-    if not root.is_dir() or not photos_in(root):
+    paths = {path.name: path for path in photos_in(root)} if root.is_dir() else {}
+    if not paths:
         raise _wrong(f"{root} holds no picture; put photos of scenes there.")
     if not table.exists():
         raise _wrong(
             f"{table} is not there; write a line scene,object,x0,y0,x1,y1 for every object of "
             "every scene."
         )
-    paths = {path.name: path for path in photos_in(root)}
     rows: dict[str, dict[str, list[Box]]] = {}
     for line, row in _read_csv(table, ("scene", "object", *BOX)):
         where, name = f"{table} line {line}", row["object"]
@@ -205,33 +205,45 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
             )
         boxes = rows.setdefault(row["scene"], {}).setdefault(name, [])
         boxes += [] if box is None else [box]
-    missing = [name for name in paths if name not in rows]
-    if missing:
-        raise _wrong(
-            f"{table} has no line for {missing[0]}; name its objects, or remove it from {root}."
+    for name in paths:
+        if name not in rows:
+            raise _wrong(
+                f"{table} has no line for {name}; name its objects, or remove it from {root}."
+            )
+    masks = _read_masks(folder, rows)
+    return tuple(
+        Scene(
+            name,
+            path,
+            {obj: np.array(each, np.float32).reshape(-1, 4) for obj, each in rows[name].items()},
+            masks.get(name, {}),
         )
-    scenes = []
-    for name, path in paths.items():
-        of_scene = {
-            obj: np.array(boxes, np.float32).reshape(-1, 4) for obj, boxes in rows[name].items()
-        }
-        masks = {}
-        place = folder / MASKS / name
-        for mask in photos_in(place) if place.is_dir() else ():
-            if len(of_scene.get(mask.stem, ())) != 1:
+        for name, path in paths.items()
+    )
+
+
+def _read_masks(
+    folder: Path, rows: Mapping[str, Mapping[str, list[Box]]]
+) -> dict[str, dict[str, Path]]:
+    """The masks of every scene's objects, `rows`."""
+    root, found = folder / MASKS, {}
+    for place in sorted(root.iterdir()) if root.is_dir() else ():
+        if not place.is_dir():
+            continue
+        name = place.name
+        if name not in rows:
+            raise _wrong(
+                f"{place} holds masks of no scene; name the folder as the scene's file, for "
+                "example masks/desk.jpg."
+            )
+        found[name] = {mask.stem: mask for mask in photos_in(place)}
+        for stem, mask in found[name].items():
+            if len(rows[name].get(stem, ())) != 1:
                 raise _wrong(
-                    f"{mask} is a mask, but {SCENES_CSV} gives no single box of {mask.stem!r} in "
+                    f"{mask} is a mask, but {SCENES_CSV} gives no single box of {stem!r} in "
                     f"{name}; name masks as {MASKS}/SCENE/OBJECT.png."
                 )
-            masks[mask.stem] = mask
-        scenes.append(Scene(name, path, of_scene, masks))
-    for path in sorted((folder / MASKS).iterdir()) if (folder / MASKS).is_dir() else ():
-        if path.is_dir() and path.name not in paths:
-            raise _wrong(
-                f"{path} holds masks of no scene; name the folder as the scene's file, for example "
-                "masks/desk.jpg."
-            )
-    return tuple(scenes)
+    return found
 
 
 def read_categories(
@@ -311,6 +323,7 @@ def measure_scene(
     rgb = load_photo(scene.path, long_side=None)
     scene = clip_boxes(scene, rgb)
     owners = np.array([name for name, boxes in scene.boxes.items() for _ in boxes], str)
+    kinds = np.array([photo_set.categories[owner] for owner in owners], str)
     true_boxes = _true_boxes(np.concatenate([np.zeros((0, 4), np.float32), *scene.boxes.values()]))
     stack = attender.stack
     candidates = segment(rgb, embed(rgb, judge(rgb, true_boxes, stack), stack), stack)
@@ -319,20 +332,17 @@ def measure_scene(
         if name not in memory:
             continue
         category = photo_set.categories[name]
-        own = owners == name
-        alike = np.array([photo_set.categories[owner] == category for owner in owners], bool)
-        row: Row = {
+        own, alike = owners == name, kinds == category
+        row = {
             "scene": scene.name,
             "object": name,
             "category": category,
             "present": len(boxes) > 0,
             "lookalikes": int((alike & ~own).sum()),
+            **_ground(rgb, boxes, memory[name], attender),
         }
-        row |= _ground(rgb, boxes, memory[name], attender)
-        if len(boxes):
-            every = np.ones(len(own), bool)
-            for among, eligible in (("all", every), ("kind", alike)):
-                row |= _vote(among, own, eligible, candidates, memory[name], attender, rgb)
+        for among, eligible in (("all", own | True), ("kind", alike)) if len(boxes) else ():
+            row |= _vote(among, own, eligible, candidates, memory[name], attender, rgb)
         rows.append(row)
     return rows
 
@@ -378,29 +388,30 @@ def _ground(
     started, cpu_started = perf_counter(), process_time()
     instruction = f"bring my {obj.category}"
     _, attended = attender.start({CAMERA: rgb}, instruction, objects=[obj.name])
-    seconds, cpu_seconds = perf_counter() - started, process_time() - cpu_started
+    ms, cpu_ms = 1000 * (perf_counter() - started), 1000 * (process_time() - cpu_started)
     (grounding,) = attended.groundings[CAMERA]
     candidates, chosen = grounding.candidates, grounding.chosen
     overlap = box_iou(candidates.xyxy, boxes).max(axis=1, initial=0.0)
-    elected: Row = dict.fromkeys((*BOX, "cosine", "likeness", "chosen_iou", "margin"))
+    elected = dict.fromkeys((*BOX, "cosine", "likeness", "chosen_iou", "margin", "verified"))
     if chosen is not None:
-        elected = dict(zip(BOX, candidates.xyxy[chosen].tolist(), strict=True))
-        elected["cosine"] = float(grounding.similarity[chosen].mean())
-        elected["likeness"] = float(grounding.likeness[chosen])
-        elected["chosen_iou"] = float(overlap[chosen])
-        elected["margin"] = grounding.ballot.margin
-    points = None
-    if chosen is not None and candidates.verified is not None:
-        points = int(candidates.verified[chosen])
+        verified = candidates.verified
+        elected = {
+            **dict(zip(BOX, candidates.xyxy[chosen].tolist(), strict=True)),
+            "cosine": float(grounding.similarity[chosen].mean()),
+            "likeness": float(grounding.likeness[chosen]),
+            "chosen_iou": float(overlap[chosen]),
+            "margin": grounding.ballot.margin,
+            "verified": None if verified is None else int(verified[chosen]),
+        }
     return {
         "candidates": len(overlap),
         "proposed_iou": float(overlap.max(initial=0.0)),
         "tinted": grounding.winner is not None,
-        "verified": points,
+        "verified": elected.pop("verified"),
         "familiar": candidates.familiar,
         "iou": 0.0 if grounding.winner is None else float(overlap[grounding.winner]),
-        "ms": round(1000 * seconds, 1),
-        "cpu_ms": round(1000 * cpu_seconds, 1),
+        "ms": round(ms, 1),
+        "cpu_ms": round(cpu_ms, 1),
         **elected,
     }
 
@@ -495,8 +506,10 @@ def single_rows(memory: Mapping[str, PersonalObject], stack: Stack) -> list[Row]
             references = list(chosen[int(rng.integers(len(chosen)))])
             left_out = np.setdiff1d(np.arange(len(own)), references)
             candidates = [own[int(rng.choice(left_out))]]
-            for rival in pairs[int(rng.integers(len(pairs)))]:
-                candidates.append(rows_of[rival][int(rng.integers(len(rows_of[rival])))])
+            candidates.extend(
+                rows_of[rival][int(rng.integers(len(rows_of[rival])))]
+                for rival in pairs[int(rng.integers(len(pairs)))]
+            )
             cosine = similarity(np.stack(candidates), own[references])
             rows.append({"object": name, "right": vote(cosine).winner == 0})
     return rows
@@ -529,8 +542,7 @@ class Pan:
     def with_twins(self, boxes: Float[np.ndarray, "n 4"]) -> Float64[np.ndarray, "m 4"]:
         """Each box of the photo, and then that of its copy."""
         twin = np.array([self.photo_width, 0.0, self.photo_width, 0.0])
-        pairs = np.stack([boxes.astype(np.float64), boxes + twin], axis=1)
-        return pairs.reshape(-1, 4)
+        return np.stack([boxes.astype(np.float64), boxes + twin], axis=1).reshape(-1, 4)
 
 
 def pan_over(rgb: Rgb) -> Pan:
@@ -563,29 +575,26 @@ def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
     rgb = load_photo(scene.path, long_side=None)
     scene = clip_boxes(scene, rgb)
     pan = pan_over(rgb)
+    known = {subject.name for subject in photo_set.subjects}
     rows: list[Row] = []
-    for name in (subject.name for subject in photo_set.subjects):
-        if not len(scene.boxes.get(name, ())):
+    for name, boxes in scene.boxes.items():
+        if name not in known or not len(boxes):
             continue
-        pair = pan.with_twins(scene.boxes[name][:1])
-        row: Row = {"scene": scene.name, "object": name, "frames": FRAMES}
-        row |= {"in_view": 0, "on_object": 0, "on_twin": 0, "end": ""}
-        states: list[Any] = []
+        pair = pan.with_twins(boxes[:1])
+        ends, seen, states = [], [], None
         for number, frame in enumerate(frames_of(rgb, pan)):
-            if number == 0:
+            if states is None:
                 states, mask = _start(frame, pan, scene, name, stack)
             else:
                 states, tracks = stack.tracker.step(states, [frame])
                 mask = tracks[0][0].mask
             here = pan.boxes(number, pair)
-            row["end"] = lies_on(mask, here)
-            if visible_share(here[0], frame) >= IN_VIEW:
-                row["in_view"] += 1
-                row["on_object"] += row["end"] == "object"
-            row["on_twin"] += row["end"] == "twin"
-        rows.append(row)
-    order = list(scene.boxes)
-    return sorted(rows, key=lambda row: order.index(row["object"]))
+            ends.append(lies_on(mask, here))
+            seen.append(visible_share(here[0], frame) >= IN_VIEW)
+        on_object = sum(end == "object" for end, is_seen in zip(ends, seen, strict=True) if is_seen)
+        row = {"scene": scene.name, "object": name, "frames": FRAMES, "in_view": sum(seen)}
+        rows.append(row | dict(on_object=on_object, on_twin=ends.count("twin"), end=ends[-1]))
+    return rows
 
 
 def _start(
@@ -609,8 +618,7 @@ def visible_share(box: Float64[np.ndarray, "4"], frame: Rgb) -> float:
     """The share of a box that lies inside of the frame."""
     height, width = frame.shape[:2]
     inside = np.clip(box, 0, (width, height, width, height))
-    sides = np.maximum(inside[2:] - inside[:2], 0)
-    return float(sides.prod() / (box[2:] - box[:2]).prod())
+    return float(np.maximum(inside[2:] - inside[:2], 0).prod() / (box[2:] - box[:2]).prod())
 
 
 def lies_on(mask: Mask | None, pair: Float64[np.ndarray, "2 4"]) -> str:
@@ -649,16 +657,16 @@ def text_report(table: "pd.DataFrame") -> str:
 
 def _judged(table: "pd.DataFrame") -> "pd.DataFrame":
     """With what became of every question."""
-    right, loose = table.iou >= RIGHT_IOU, table.iou >= LOOSE_IOU
+    right, silent = table.iou >= RIGHT_IOU, ~table.tinted.astype(bool)
     elected = table.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU
     return table.assign(
         **{
             "proposed": table.proposed_iou >= RIGHT_IOU,
             "right": right,
-            "right at IoU .25": loose,
-            "wrong tinted": table.tinted & ~right,
-            "silent": ~table.tinted.astype(bool),
-            "not in view": (~table.tinted.astype(bool)).where(elected),
+            "right at IoU .25": table.iou >= LOOSE_IOU,
+            "wrong tinted": ~silent & ~right,
+            "silent": silent,
+            "not in view": silent.where(elected),
         }
     )
 
@@ -668,15 +676,15 @@ def object_table(table: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     found = _judged(table)
-    seen, absent = found.present.astype(bool), ~found.present.astype(bool)
+    seen = found.present.astype(bool)
     flags = {
         "in view": seen,
         "right": seen & found.right,
         "IoU .25": seen & found["right at IoU .25"],
         "wrong": seen & found["wrong tinted"],
         "silent": seen & found.silent,
-        "absent": absent,
-        "tinted": absent & found.tinted.astype(bool),
+        "absent": ~seen,
+        "tinted": ~seen & ~found.silent,
     }
     keyed = found[["object"]].assign(kind=found.category, **flags)
     whole = pd.concat([keyed.sort_values(["object", "kind"]), keyed.assign(object="all", kind="")])
@@ -689,22 +697,22 @@ def scene_table(table: "pd.DataFrame") -> "pd.DataFrame":
 
     found = _judged(table)
     seen, beside = found.present.astype(bool), found.lookalikes > 0
-    kinds = {
-        "object in view": seen,
-        "- beside look-alikes": seen & beside,
-        "- alone of its kind": seen & ~beside,
-        "object absent": ~seen,
-        "- look-alikes in view": ~seen & beside,
-        "- none of its kind": ~seen & ~beside,
-    }
-    measures = ["proposed", "right", "right at IoU .25", "wrong tinted", "silent", "not in view"]
-    lines: list[dict[str, Any]] = []
-    for name, chosen in kinds.items():
-        cells = dict.fromkeys(measures, "")
-        for each in measures if len(lines) < 3 else ("wrong tinted", "silent"):
-            cells[each] = share_by(found[chosen], each, ["scene"]).text(digits=0)
-        lines.append({"scenes": name, **cells})
-    return pd.DataFrame(lines)
+    given_absent = ["wrong tinted", "silent"]
+    measures = ["proposed", "right", "right at IoU .25", *given_absent, "not in view"]
+    kinds = (
+        ("object in view", seen, measures),
+        ("- beside look-alikes", seen & beside, measures),
+        ("- alone of its kind", seen & ~beside, measures),
+        ("object absent", ~seen, given_absent),
+        ("- look-alikes in view", ~seen & beside, given_absent),
+        ("- none of its kind", ~seen & ~beside, given_absent),
+    )
+    lines = [
+        {"scenes": name}
+        | {each: share_by(found[chosen], each, ["scene"]).text(digits=0) for each in given}
+        for name, chosen, given in kinds
+    ]
+    return pd.DataFrame(lines, columns=["scenes", *measures]).fillna("")
 
 
 def vote_table(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -764,15 +772,13 @@ def write_sheets(photo_set: PhotoSet, table: "pd.DataFrame", folder: Path) -> li
     Raises: BadOutput.
     """
     scenes = {scene.name: scene for scene in photo_set.scenes}
-    tiles = []
+    tiles, paths = [], []
     for name, part in table.groupby("scene", sort=True):
         rgb = load_photo(scenes[str(name)].path, long_side=None)
         tiles += [_tile(rgb, scenes[str(name)], row) for row in part.to_dict("records")]
-    paths = []
-    for first in range(0, len(tiles), TILES):
-        path = folder / f"sheet-{1 + first // TILES:02}.png"
-        write_picture(path, join_tiles(tiles[first : first + TILES], gap_px=GAP_PX))
-        paths.append(path)
+    for number, some in enumerate(batched(tiles, TILES), 1):
+        paths.append(folder / f"sheet-{number:02}.png")
+        write_picture(paths[-1], join_tiles(some, gap_px=GAP_PX))
     return paths
 
 

@@ -133,18 +133,13 @@ def gather_photos(paths: Sequence[Path]) -> list[Path]:
 
     Raises: BadPhoto.
     """
-    found: list[Path] = []
-    for path in paths:
-        if not os.path.isdir(path):
-            found.append(path)
-            continue
-        inside = photos_in(path)
-        if not inside:
-            raise BadPhoto(f"register: {path} holds no picture; name a folder of photos.")
-        found.extend(inside)
     once: dict[str, Path] = {}
-    for path in found:
-        once.setdefault(os.path.realpath(path), path)
+    for path in paths:
+        found = photos_in(path) if os.path.isdir(path) else [path]
+        if not found:
+            raise BadPhoto(f"register: {path} holds no picture; name a folder of photos.")
+        for photo in found:
+            once.setdefault(os.path.realpath(photo), photo)
     return list(once.values())
 
 
@@ -155,11 +150,9 @@ def film_photos(video: Path, folder: Path, count: int) -> list[Path]:
     """
     if not is_video(video):
         raise BadPhoto(f"register: {video} is no video by its name; export it as MP4.")
-    paths = []
-    for i, rgb in enumerate(sharp_frames(video, count)):
-        path = folder / f"{video.stem}-{i + 1}.png"
+    paths = [folder / f"{video.stem}-{i + 1}.png" for i in range(count)]
+    for path, rgb in zip(paths, sharp_frames(video, count), strict=True):
         write_picture(path, rgb)
-        paths.append(path)
     return paths
 
 
@@ -172,10 +165,8 @@ def parse_given(
 
     Raises: BadPhoto.
     """
-    given = {}
-    for text in boxes:
-        number, words = _split(text, photos, "--box", "x0,y0,x1,y1")
-        given[number] = _parse_box(text, words)
+    split = [(text, *_split(text, photos, "--box", "x0,y0,x1,y1")) for text in boxes]
+    given = {number: _parse_box(text, words) for text, number, words in split}
     for text in masks:
         number, words = _split(text, photos, "--mask", "MASK.png")
         given[number] = _box_of_mask(Path(words), photos[number])
@@ -245,12 +236,11 @@ def remember_references(
 
 def fit_crop(crop: Rgb) -> Rgb:
     """A crop of at most CROP_SIDE pixels."""
-    import cv2
-
-    scale = CROP_SIDE / max(crop.shape[:2])
+    height, width = crop.shape[:2]
+    scale = CROP_SIDE / max(height, width)
     if scale >= 1:
         return crop
-    size = (max(1, round(crop.shape[1] * scale)), max(1, round(crop.shape[0] * scale)))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
 
 
@@ -339,21 +329,14 @@ def next_words(
 
 def _split(text: str, photos: Sequence[Path], option: str, form: str) -> tuple[int, str]:
     """The photo's number and the rest of "PHOTO=REST"; both may hold "=", too."""
-    photo = ""
-    for path in photos:
-        for known in (str(path), path.name):
-            if text.startswith(f"{known}=") and len(known) > len(photo):
-                photo = known
-    fitting = []
-    for i, path in enumerate(photos):
-        if photo in (str(path), path.name):
-            fitting.append(i)
+    names = [name for path in photos for name in (str(path), path.name)]
+    photo = max((name for name in names if text.startswith(f"{name}=")), key=len, default="")
+    fitting = [i for i, path in enumerate(photos) if photo in (str(path), path.name)]
     words = text[len(photo) :].removeprefix("=")
     if not photo and "=" not in words and len(photos) == 1:
         fitting = [0]
     if len(fitting) != 1:
-        names = [shlex.quote(_shortest_name(path, photos)) for path in photos[:6]]
-        known = ", ".join(names)
+        known = ", ".join(shlex.quote(_shortest_name(path, photos)) for path in photos[:6])
         raise BadPhoto(
             f"register: {option} {text!r} names no single photo; write {option} PHOTO={form} with "
             f"one of {known}."
@@ -437,37 +420,28 @@ def leave_one_out(
     encoder: Encoder,
 ) -> Trust:
     """Elect each reference by the others among the crops of the bank and of the background."""
-    background: list[Rgb] = []
-    for reference in references:
-        background.extend(reference.others)
-    rows = [embed_crops("remember", encoder, background)]
-    names = [""] * len(background)
-    for other in bank.values():
-        if other.name != obj.name and other.encoder == obj.encoder:
-            rows.append(other.embeddings)
-            names += [other.name] * len(other.embeddings)
-    rivals = np.concatenate(rows)
-    right, margins, beaten_by = 0, [], []
+    background = [crop for reference in references for crop in reference.others]
+    known = [each for each in bank.values() if each.name != obj.name]
+    known = [each for each in known if each.encoder == obj.encoder]
+    names = [""] * len(background) + [each.name for each in known for _ in each.embeddings]
+    crops = embed_crops("remember", encoder, background)
+    rivals = np.concatenate([crops, *(each.embeddings for each in known)])
+    winners, margins = [], []
     n = len(obj.embeddings)
-    if n >= FEWEST and len(rivals):
-        for k in range(n):
-            others = np.delete(obj.embeddings, k, axis=0)
-            candidates = np.concatenate([obj.embeddings[k : k + 1], rivals])
-            cosine = similarity(candidates, others)
-            winner = vote(cosine).winner
-            assert winner is not None
-            mean = cosine.mean(axis=1)
-            margins.append(float(mean[0] - mean[1:].max()))
-            right += winner == 0
-            if winner and names[winner - 1]:
-                beaten_by.append(names[winner - 1])
+    for k in range(n) if n >= FEWEST and len(rivals) else ():
+        others = np.delete(obj.embeddings, k, axis=0)
+        cosine = similarity(np.concatenate([obj.embeddings[k : k + 1], rivals]), others)
+        winners.append(vote(cosine).winner or 0)
+        mean = cosine.mean(axis=1)
+        margins.append(float(mean[0] - mean[1:].max()))
+    beaten_by = {names[winner - 1] for winner in winners if winner}
     return Trust(
-        right=right,
+        right=winners.count(0),
         n=n,
         margin=min(margins, default=float("nan")),
         others=len(rivals) - len(background),
         background=len(background),
-        by_name=tuple(sorted(set(beaten_by))),
+        by_name=tuple(sorted(beaten_by - {""})),
     )
 
 
@@ -475,22 +449,18 @@ def warnings(
     obj: PersonalObject, references: Sequence[Reference], names: Sequence[str]
 ) -> list[str]:
     """What is wrong with references that are used all the same, one line each."""
-    lines = []
-    for name, reference in zip(names, references, strict=True):
-        height, width = reference.crop.shape[:2]
-        if min(height, width) < SMALL_PX:
-            lines.append(
-                f"{name}: the object is only {width}x{height} pixels; go nearer, or take more "
-                "pixels"
-            )
+    shapes = [reference.crop.shape[:2] for reference in references]
+    lines = [
+        f"{name}: the object is only {width}x{height} pixels; go nearer, or take more pixels"
+        for name, (height, width) in zip(names, shapes, strict=True)
+        if min(height, width) < SMALL_PX
+    ]
     cosine = obj.embeddings @ obj.embeddings.T
-    k = len(cosine)
-    for i, name in enumerate(names):
-        if k > 1:
-            to_others = float((cosine[i].sum() - cosine[i, i]) / (k - 1))
-            if to_others < LEAST_COSINE:
-                lines.append(
-                    f"{name}: unlike the other references (mean cosine {to_others:.2f}); is it "
-                    "the same object?"
-                )
+    to_others = (cosine.sum(axis=1) - cosine.diagonal()) / max(len(cosine) - 1, 1)
+    for name, mean in zip(names, to_others.tolist(), strict=False):
+        if len(cosine) > 1 and mean < LEAST_COSINE:
+            lines.append(
+                f"{name}: unlike the other references (mean cosine {mean:.2f}); is it the same "
+                "object?"
+            )
     return lines

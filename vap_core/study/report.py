@@ -4,7 +4,7 @@ import base64
 import json
 import os
 from collections import Counter
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from html import escape
 from io import BytesIO
@@ -77,6 +77,8 @@ def suites_table() -> str:
 
     Raises: BadSuite for a damaged list.
     """
+    import pandas as pd
+
     tracks, tasks = [], []
     for name, suite in LISTED.items():
         about = dict(suite=name, robot=suite.robot, cameras=" ".join(suite.cameras), Hz=suite.hz)
@@ -105,19 +107,13 @@ def suites_table() -> str:
             f"warm-up {name}: {suite.robot}, {len(suite.tasks)} picks of "
             f"{suite.tasks[0].max_steps} steps, any number of episodes"
         )
-    return "\n\n".join([_lines(tracks), _lines(tasks), "\n".join(notes)])
-
-
-def _lines(lines: Sequence[Mapping[str, Any]]) -> str:
-    import pandas as pd
-
-    return printed(pd.DataFrame(list(lines)))
+    return "\n\n".join([*map(printed, map(pd.DataFrame, (tracks, tasks))), "\n".join(notes)])
 
 
 def rates_in(lines: "pd.DataFrame", name: str) -> list[str]:
     """A rate of `results` with its interval, in percent."""
-    columns = (lines[name], lines[f"{name}_low"], lines[f"{name}_high"])
-    return [percent_interval(*each) for each in zip(*columns, strict=True)]
+    columns = (lines[f"{name}{part}"] for part in ("", "_low", "_high"))
+    return list(map(percent_interval, *columns))
 
 
 def result_table(lines: "pd.DataFrame", published: "pd.DataFrame") -> "pd.DataFrame":
@@ -247,19 +243,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
     ends = outcomes(runs)
     origins = provenance(runs)
     compared = compare(runs.table, runs.methods)
-    text = "\n\n".join(
-        [
-            "# Report",
-            _opening(runs),
-            *_results_section(lines, paper_results(runs)),
-            *_outcomes_section(runs, ends),
-            *_failures_section(runs),
-            *_comparisons_section(compared),
-            *_abstention_section(runs),
-            *_pictures_section(with_differences=len(compared) > 0),
-            *_provenance_section(origins),
-        ]
-    )
+    text = "\n\n".join(["# Report", *_sections(runs, lines, ends, compared, origins)])
     rates = [f"{name}{part}" for name in RATES for part in ("", "_low", "_high")]
     rates += ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
     figures = {"forest.png": forest(lines)}
@@ -267,18 +251,13 @@ def report(sources: Sequence[Path], out: Path) -> str:
         track_title(str(suite), str(split)): result_table(part, lines.iloc[:0])
         for (suite, split), part in lines.groupby(TRACK, sort=False)
     }
+    tables = {"Results": by_track, "Outcomes": {"": outcome_table(ends)}}
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv(lines, rates),
         "outcomes.csv": _csv(ends),
         "provenance.csv": _csv(origins),
-        "report.html": report_page(
-            runs,
-            {"Results": by_track, "Outcomes": {"": outcome_table(ends)}},
-            figures["forest.png"],
-            sources,
-            out,
-        ),
+        "report.html": report_page(runs, tables, figures["forest.png"], sources, out),
     }
     if len(compared):
         files["comparisons.csv"] = _csv(compared, ["difference", "low", "high"])
@@ -289,10 +268,61 @@ def report(sources: Sequence[Path], out: Path) -> str:
             write_atomic(out / name, content.encode())
         for name, figure in figures.items():
             write_png(figure, out / name)
-        for name in ("paired.png", "comparisons.csv"):  # of an earlier report
-            if name not in files and name not in figures:
-                (out / name).unlink(missing_ok=True)
+        for name in {"paired.png", "comparisons.csv"} - {*files, *figures}:  # of an earlier report
+            (out / name).unlink(missing_ok=True)
     return text
+
+
+def _sections(
+    runs: Runs,
+    lines: "pd.DataFrame",
+    ends: "pd.DataFrame",
+    compared: "pd.DataFrame",
+    origins: "pd.DataFrame",
+) -> Iterator[str]:
+    """The paragraphs of report.md behind its title."""
+    several = "s" if len(runs.manifests) > 1 else ""
+    asked = f"{runs.wanted['asked'].sum()} episodes that {len(runs.manifests)} run{several}"
+    yield "\n".join(
+        [
+            f"{len(runs.table)} of the {asked} asked for.",
+            *(f"**Unfinished**: {line}" for line in runs.unfinished),
+            *(f"**Not alike**: {line}" for line in runs.unlike),
+        ]
+    )
+    yield from _results_section(lines, paper_results(runs))
+    yield from ("## Outcomes", printed(outcome_table(ends), "markdown"))
+    tracebacks = [f"- {line}" for line in errors(runs)]
+    if tracebacks:
+        yield "\n".join(["Errors, by the last line of their tracebacks:", *tracebacks])
+    if "case" in runs.table:  # else the runs are older than the diagnosis
+        counts = breakdown(runs.table)
+        yield from ("## Why episodes failed", FAILURES_NOTE)
+        yield printed(breakdown_table(counts), "markdown")
+        yield "- " + sub_cases_text(counts).replace("\n", "\n- ")
+    yield "## Methods compared"
+    if len(compared):
+        yield from (COMPARISONS_NOTE, printed(comparison_table(compared), "markdown"))
+    else:
+        yield "No two methods ran the same episodes under one policy."
+    found = abstentions(runs.table)
+    if len(found):  # a suite was run with and without its targets
+        yield from ("## Abstention", ABSTENTION_NOTE, printed(found, "markdown"))
+    yield from ("## Pictures", "![Success rates with 95 % intervals](forest.png)")
+    if len(compared):
+        yield "![Differences from the first method on the same episodes](paired.png)"
+    yield "## Provenance"
+    always, where_any = TOLD[:4], TOLD[4:]
+    yield "\n".join(
+        f"- {line['run']}: "
+        + ", ".join(f"{n} {line[n]}" for n in (*always, *(n for n in where_any if line[n])))
+        + f"\n  `{line['command']}`"
+        for line in origins.to_dict("records")
+    )
+
+
+TOLD = ("digest", "version", "seed", "policy", "stack", "robots", "world", "weights", "lists")
+"""What the report says of a run; but for the first four where it is known."""
 
 
 def _csv(table: "pd.DataFrame", fractions: Sequence[str] = ()) -> str:
@@ -337,18 +367,6 @@ def differences(compared: "pd.DataFrame", line: str = "task") -> "Figure":
     )
 
 
-def _opening(runs: Runs) -> str:
-    """How many episodes there are, which runs are unfinished, and in what they differ."""
-    several = "s" if len(runs.manifests) > 1 else ""
-    lines = [
-        f"{len(runs.table)} of the {runs.wanted['asked'].sum()} episodes that "
-        f"{len(runs.manifests)} run{several} asked for."
-    ]
-    lines += [f"**Unfinished**: {line}" for line in runs.unfinished]
-    lines += [f"**Not alike**: {line}" for line in runs.unlike]
-    return "\n".join(lines)
-
-
 def _results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> list[str]:
     parts = ["## Results", RESULTS_NOTE]
     for suite, of_suite in lines.groupby("suite", sort=False):
@@ -363,58 +381,6 @@ def _results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> list[s
             numbered = "\n".join(f"{i}. {note}" for i, note in enumerate(notes, 1))
             parts.append(f"Footnotes to the paper's numbers:\n\n{numbered}")
     return parts
-
-
-def _outcomes_section(runs: Runs, ends: "pd.DataFrame") -> list[str]:
-    parts = ["## Outcomes", printed(outcome_table(ends), "markdown")]
-    listed = "\n".join(f"- {line}" for line in errors(runs))
-    return [*parts, f"Errors, by the last line of their tracebacks:\n{listed}"] if listed else parts
-
-
-def _failures_section(runs: Runs) -> list[str]:
-    """How the failures divide into cases; empty for runs that are older than the diagnosis."""
-    if "case" not in runs.table:
-        return []
-    counts = breakdown(runs.table)
-    sub_cases = "- " + sub_cases_text(counts).replace("\n", "\n- ")
-    table = printed(breakdown_table(counts), "markdown")
-    return ["## Why episodes failed", FAILURES_NOTE, table, sub_cases]
-
-
-def _comparisons_section(compared: "pd.DataFrame") -> list[str]:
-    title = "## Methods compared"
-    if compared.empty:
-        return [title, "No two methods ran the same episodes under one policy."]
-    return [title, COMPARISONS_NOTE, printed(comparison_table(compared), "markdown")]
-
-
-def _abstention_section(runs: Runs) -> list[str]:
-    """Success against coverage; empty where no suite was run with and without its targets."""
-    found = abstentions(runs.table)
-    if found.empty:
-        return []
-    return ["## Abstention", ABSTENTION_NOTE, printed(found, "markdown")]
-
-
-def _pictures_section(with_differences: bool) -> list[str]:
-    parts = ["## Pictures", "![Success rates with 95 % intervals](forest.png)"]
-    paired = "![Differences from the first method on the same episodes](paired.png)"
-    return [*parts, paired] if with_differences else parts
-
-
-def _provenance_section(origins: "pd.DataFrame") -> list[str]:
-    """A line per run (`provenance`), and its command."""
-    lines = []
-    for line in origins.to_dict("records"):
-        told = ("digest", "version", "seed", "policy", "stack", "robots", "world")
-        always = told[:4]
-        parts = [
-            f"{name} {line[name]}"
-            for name in (*told, "weights", "lists")
-            if line[name] or name in always
-        ]
-        lines.append(f"- {line['run']}: {', '.join(parts)}\n  `{line['command']}`")
-    return ["## Provenance", "\n".join(lines)]
 
 
 MOST_FAILURES = 24
@@ -544,12 +510,13 @@ def _views(recording: Path, frame: int) -> "dict[str, Rgb]":
 
     entities = prompted_entities(recording)
     pictures = read_pictures(recording, set(entities.values()))
-    views = {}
-    for camera, entity in entities.items():
-        before = [step for step in pictures[entity] if step <= frame]
-        if before:
-            views[camera] = pictures[entity][max(before)]
-    return views
+    before = {
+        camera: [step for step in pictures[entity] if step <= frame]
+        for camera, entity in entities.items()
+    }
+    return {
+        camera: pictures[entities[camera]][max(steps)] for camera, steps in before.items() if steps
+    }
 
 
 def _jpeg(rgb: "Rgb") -> str:
@@ -559,14 +526,17 @@ def _jpeg(rgb: "Rgb") -> str:
     image.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
     data = BytesIO()
     image.save(data, "JPEG", quality=78)
-    return f"data:image/jpeg;base64,{base64.b64encode(data.getvalue()).decode()}"
+    return _inline("jpeg", data)
+
+
+def _inline(kind: str, data: BytesIO) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
 
 
 def _picture(figure: "Figure", words: str) -> str:
     data = BytesIO()
     figure.savefig(data, format="png", dpi=100, metadata={"Software": None})
-    inside = base64.b64encode(data.getvalue()).decode()
-    return f"<img alt='{escape(words)}' src='data:image/png;base64,{inside}'>"
+    return f"<img alt='{escape(words)}' src='{_inline('png', data)}'>"
 
 
 def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:

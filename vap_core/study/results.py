@@ -112,7 +112,7 @@ def _wrong_column(episodes: "pd.DataFrame") -> str:
     def is_flag(kept: "pd.Series") -> bool:
         return bool(kept.dropna().isin([True, False]).all())
 
-    checks: dict[str, tuple[Callable[[Any], bool], str]] = {
+    checks = {
         "text": (lambda kept: bool(kept.map(_is_text).all()), "suite task method policy outcome"),
         "text, or nothing": (
             lambda kept: bool(kept.dropna().map(_is_text).all()),
@@ -260,11 +260,13 @@ def publish(
         )
     named = ((source, manifest) for source, manifest, _ in runs)
     require_same_scenes(named, "publish", "publish them in tables of their own")
-    tables = []
-    for _, manifest, episodes in runs:
-        hidden = episodes.columns.str.fullmatch("detail|peak_mb|seconds_.*")
-        kept = episodes.loc[:, ~hidden].assign(configuration=manifest["digest"])
-        tables.append(pa.Table.from_pandas(kept, preserve_index=False))
+    kept = [
+        episodes.loc[:, ~episodes.columns.str.fullmatch("detail|peak_mb|seconds_.*")].assign(
+            configuration=manifest["digest"]
+        )
+        for _, manifest, episodes in runs
+    ]
+    tables = [pa.Table.from_pandas(table, preserve_index=False) for table in kept]
     whole = pa.concat_tables(tables, promote_options="permissive")
     if whole.select([*KEY, "policy"]).to_pandas().duplicated().any():
         raise BadOutput(
@@ -643,9 +645,9 @@ def provenance(runs: Runs) -> "pd.DataFrame":
 
     lines = []
     for name, manifest in runs.manifests.items():
-        study: dict[str, Any] = manifest["configuration"]
+        study = manifest["configuration"]
         first, count = study["seed"], study.get("seeds", 1)
-        about: dict[str, Any] = {
+        about = {
             "run": str(name),
             "digest": manifest["digest"],
             "version": study.get("version", ""),
@@ -675,7 +677,7 @@ def command_line(study: dict[str, Any]) -> str:
     It finds the user's own suites, where they are known here.
     """
     files = suites.own_files(suite for suite, _ in study["tasks"])
-    changed: dict[str, Any] = {
+    changed = {
         "tasks": tuple(tuple(task) for task in study["tasks"]),
         "methods": tuple(study["methods"]),
     }

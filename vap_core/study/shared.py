@@ -4,7 +4,6 @@ episodes = shared_episodes(Path("data/results/shared.parquet"))
 sequence_table(episodes)
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -189,7 +188,7 @@ def shared_figure(episodes: "pd.DataFrame", title: str = "") -> "Figure":
 
     pairs = pair_table(episodes).rename(columns={"SR": "both"}).assign(paper=paper_pair(ALL) / 100)
     turns = sequence_table(episodes).assign(paper=paper_sequence()["both"] / 100)
-    marks: Sequence[pd.DataFrame] = [
+    marks = [
         tidy(turns[[*BY, "n", "both", "step 1", "paper"]], ["both", "step 1"]),
         tidy(pairs[[*BY, "n", "both", "paper"]], ["both"]),
     ]

@@ -6,6 +6,7 @@ every variant. `share` takes rows for independent; `share_by`, `mean_by`, `summa
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -181,7 +182,7 @@ def summary(
     groups = rows.groupby([*by], sort=False, observed=True) if by else [((), rows)]
     lines = []
     for key, part in groups:
-        line: dict[str, Any] = {**dict(zip(by, key, strict=True)), "n": len(part)}
+        line = {**dict(zip(by, key, strict=True)), "n": len(part)}
         for name in share:
             line[name] = share_by(part, name, cluster) if cluster else _share(part[name])
         for name in mean:
@@ -203,10 +204,8 @@ def tidy(table: "pd.DataFrame", measures: Sequence[str], name: str = "measure") 
     lines = []
     for line in table.to_dict("records"):
         for measure in measures:
-            found = line[measure]
             about = {column: line[column] for column in kept}
-            numbers = dict(n=found.n, value=found.value, low=found.low, high=found.high)
-            lines.append({**about, name: measure, **numbers})
+            lines.append({**about, name: measure, **asdict(line[measure])})
     return pd.DataFrame(lines)
 
 
@@ -402,8 +401,7 @@ def holm(p: "Sequence[float] | pd.Series[float]") -> list[float]:
 def ratio(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, float]:
     """Geometric mean of the ratios within each repeat, and its 95 % interval (Student's, of the
     logarithms)."""
-    logs = np.log(np.array(slow) / np.array(fast))
-    found = student(logs)
+    found = student(np.log(np.array(slow) / np.array(fast)))
     low, high = np.exp([found.low, found.high]).tolist()
     return float(np.exp(found.value)), low, high
 
@@ -561,8 +559,7 @@ def average_precision(
     weight = np.ones(len(score)) if times is None else times[order]
     right = weight * hit[order]
     precisions = np.cumsum(right) / np.maximum(np.cumsum(weight), 1e-9)
-    interpolated = np.maximum.accumulate(precisions[::-1])[::-1]
-    return float((interpolated * right).sum() / wanted)
+    return float((np.maximum.accumulate(precisions[::-1])[::-1] * right).sum() / wanted)
 
 
 def _percentiles(n: int, statistic: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:

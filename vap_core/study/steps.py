@@ -128,7 +128,7 @@ def recording_at(run: Path, found: "pd.DataFrame", number: int) -> tuple[Path, i
 
     if not 0 <= number < len(found):
         raise BadStudy(f"query: no line #{number}; {len(found)} were found, counted from 0.")
-    line: dict[Any, Any] = found.iloc[number].to_dict()
+    line = found.iloc[number].to_dict()
     if not line.keys() >= set(store.KEY):
         raise BadStudy(f"query: --open needs the columns {', '.join(store.KEY)}; select them, too.")
     name = recording_file_name(*(line[n] for n in ("suite", "task", "episode", "seed", "method")))

@@ -176,8 +176,7 @@ def write_part(folder: Path, kind: str, rows: Sequence[Mapping[str, Any]], calle
 
     with writing(folder, caller):
         (folder / kind).mkdir(exist_ok=True)
-        table = pd.DataFrame(list(rows))
-        data = table.to_parquet(index=False, compression="zstd")
+        data = pd.DataFrame(list(rows)).to_parquet(index=False, compression="zstd")
         path = folder / kind / f"{uuid4().hex}.parquet"
         write_atomic(path, data)
         return path

@@ -53,8 +53,7 @@ def text_of(cell: Any) -> str:
     """A cell as one line of printable text."""
     if cell is None or cell != cell:
         return "-"
-    text = f"{cell:.6g}" if isinstance(cell, float) else str(cell)
-    return printable(text, "")
+    return printable(f"{cell:.6g}" if isinstance(cell, float) else str(cell), "")
 
 
 def _no_html(cell: str) -> str:

@@ -8,7 +8,7 @@ p values take objects, not episodes, as the independent units.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -37,7 +37,16 @@ from vap_core.study import measurement, store
 from vap_core.study.engine import spread_evenly
 from vap_core.study.measurement import Measurement, Row, Tables
 from vap_core.study.perception import opening_views
-from vap_core.study.stats import Estimate, holm, rate, resampled_mean, share_by, sign_flip, student
+from vap_core.study.stats import (
+    Estimate,
+    holm,
+    rate,
+    rates,
+    resampled_mean,
+    share_by,
+    sign_flip,
+    student,
+)
 from vap_core.study.table import printed
 from vap_core.study.trials import Study, shipped
 
@@ -92,12 +101,12 @@ class Tokens(Measurement):
     caller: ClassVar[str] = "measure tokens"
 
     def __post_init__(self) -> None:
-        for place in self.places:
-            if place not in PLACES:
-                raise one_of("measure tokens: place", place, PLACES)
+        known = {"place": PLACES, "suite": suites.BENCHMARKS}
+        for what, named in (("place", self.places), ("suite", self.suites)):
+            for name in named:
+                if name not in known[what]:
+                    raise one_of(f"measure tokens: {what}", name, known[what])
         for name in self.suites:
-            if name not in suites.BENCHMARKS:
-                raise one_of("measure tokens: suite", name, suites.BENCHMARKS)
             if not shipped(name).is_dir():
                 raise BadStudy(
                     f"measure tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
@@ -164,7 +173,7 @@ class Tokens(Measurement):
         answers: list[Row] = []
         chosen: list[Row] = []
         with fused_attention():
-            measured = _measured_epochs(job.epochs)
+            measured = {0, *(max(1, round(share * job.epochs)) for share in SHARES)}
             for epoch, (step, embedding) in enumerate(lessons(teacher, target, taught, training)):
                 if epoch in measured:
                     where = {**about, "step": step, "token": "as learned", "read_by": job.where}
@@ -199,11 +208,6 @@ def publish(folder: Path, to: Path) -> list[Path]:
     return store.publish_tables(tables, to, caller=Tokens.caller)
 
 
-def _measured_epochs(epochs: int) -> set[int]:
-    """After how many epochs a token is measured."""
-    return {0, *(max(1, round(share * epochs)) for share in SHARES)}
-
-
 def _answers(
     about: Row,
     reader: "MiniVlm",
@@ -222,9 +226,10 @@ def _negatives(
 ) -> tuple[dict[str, tuple[Rgb, ...]], tuple[Rgb, ...]]:
     """Photos of every look-alike of a task's target, and of other objects."""
     rows = suites.rows(suite, task)
-    rivals = {}
-    for name in learned_token.lookalikes(rows):
-        rivals[name] = tuple(reference_views(get_object(name), learned_token.VIEWS, seed))
+    rivals = {
+        name: tuple(reference_views(get_object(name), learned_token.VIEWS, seed))
+        for name in learned_token.lookalikes(rows)
+    }
     return rivals, learned_token.other_objects(rows, seed)
 
 
@@ -232,10 +237,8 @@ def _photos(suite: str, task: str, seed: int, k: int) -> Photos:
     """What teach_token.photographs takes, with the negatives rendered once."""
     target = get_object(suites.rows(suite, task, 1)[0].target)
     rivals, others = _negatives(suite, task, seed)
-    photos: list[Rgb] = []
-    for views in rivals.values():
-        photos += views
-    return Photos(tuple(reference_views(target, k, seed)), tuple(photos), others)
+    photos = tuple(view for views in rivals.values() for view in views)
+    return Photos(tuple(reference_views(target, k, seed)), photos, others)
 
 
 def _shown(suite: str, task: str) -> dict[str, Sequence[Rgb]]:
@@ -337,15 +340,16 @@ def in_photos(shown: Sequence[Scene], photos: Mapping[str, Sequence[Rgb]]) -> tu
 
     What the model chooses there and in the scene differs by what it sees, not by what it is asked.
     """
-    found = []
-    for i, scene in enumerate(shown):
-        drawn = {}
-        for name, crops in scene.crops.items():
-            of_object = photos[name]
-            first = i * len(crops)
-            drawn[name] = tuple(of_object[(first + j) % len(of_object)] for j in range(len(crops)))
-        found.append(Scene(episode=scene.episode, target=scene.target, crops=drawn))
-    return tuple(found)
+
+    def drawn(name: str, i: int, n: int) -> tuple[Rgb, ...]:
+        return tuple(photos[name][j % len(photos[name])] for j in range(i * n, (i + 1) * n))
+
+    return tuple(
+        replace(
+            scene, crops={name: drawn(name, i, len(crops)) for name, crops in scene.crops.items()}
+        )
+        for i, scene in enumerate(shown)
+    )
 
 
 def scores(
@@ -400,23 +404,29 @@ def beside_policy(
     """
     import pandas as pd
 
-    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
-    joined = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
     first = episodes.pivot_table(
         index=KEY, columns="method", values="first_object_correct", aggfunc="first", observed=True
     )
-    joined = joined.merge(first.reset_index(), on=KEY)
     lines = {}
-    for name, part in _parts(joined):
-        line: dict[str, Estimate | float] = {"chance": float(part["chance"].mean())}
-        line[IN_PHOTOS] = share_by(part, "right_photo", OBJECTS)
-        line[IN_SCENE] = share_by(part, "right", OBJECTS)
-        for method in methods:
-            line[method] = share_by(part, method, OBJECTS)
-        line[AFTER_RIGHT] = share_by(part[part["right"]], "soft", OBJECTS)
-        line[AFTER_WRONG] = share_by(part[~part["right"]], "soft", OBJECTS)
-        lines[name] = line
+    for name, part in _parts(_chosen_twice(table).merge(first.reset_index(), on=KEY)):
+        shares = {
+            IN_PHOTOS: (part, "right_photo"),
+            IN_SCENE: (part, "right"),
+            **{method: (part, method) for method in methods},
+            AFTER_RIGHT: (part[part["right"]], "soft"),
+            AFTER_WRONG: (part[~part["right"]], "soft"),
+        }
+        lines[name] = {
+            "chance": float(part["chance"].mean()),
+            **{title: share_by(*of, OBJECTS) for title, of in shares.items()},
+        }
     return pd.DataFrame(lines).T
+
+
+def _chosen_twice(table: "pd.DataFrame") -> "pd.DataFrame":
+    """`chosen` of the scene, with `right_photo` of the photos."""
+    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
+    return chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
 
 
 def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
@@ -430,20 +440,24 @@ def losses(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     rows = []
-    steps = {TO_SCENE: _gains_of_photos(table), TO_POLICY: _gains_of_scene(table, episodes)}
-    for step, gains in steps.items():
-        of_step: list[dict[str, Any]] = []
+    both = _chosen_twice(table)
+    soft = episodes[episodes["method"] == "soft"][[*KEY, "first_object_correct"]]
+    steps = (
+        (TO_SCENE, both, "right_photo", "right"),
+        (TO_POLICY, both.merge(soft, on=KEY), "right", "first_object_correct"),
+    )
+    for step, of_step, before, after in steps:
+        gains = of_step.assign(gain=of_step[before].astype(float) - of_step[after].astype(float))
         for suite, part in _parts(gains):
             grouped = part.groupby(["suite", "object"], sort=True, observed=True)["gain"]
             by_object = grouped.agg(["sum", "size"])
-            line = {"step": step, "suite": suite, "objects": len(by_object)}
             p = sign_flip(by_object["sum"].to_numpy(float))
-            of_step.append({**line, "loss": resampled_mean(by_object), "p": p, "p_holm": p})
-        single = [line for line in of_step if line["suite"] != ALL_SUITES]
-        for line, p_holm in zip(single, holm([line["p"] for line in single]), strict=True):
-            line["p_holm"] = p_holm
-        rows += of_step
-    return pd.DataFrame(rows).set_index(["step", "suite"])
+            line = {"step": step, "suite": suite, "objects": len(by_object)}
+            rows.append({**line, "loss": resampled_mean(by_object), "p": p, "p_holm": p})
+    found = pd.DataFrame(rows)
+    for index in found[found["suite"] != ALL_SUITES].groupby("step").groups.values():
+        found.loc[index, "p_holm"] = holm(found.loc[index, "p"])
+    return found.set_index(["step", "suite"])
 
 
 def _parts(joined: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
@@ -452,21 +466,6 @@ def _parts(joined: "pd.DataFrame") -> "list[tuple[str, pd.DataFrame]]":
     if len(parts) > 1:
         parts.append((ALL_SUITES, joined))
     return parts
-
-
-def _gains_of_photos(table: "pd.DataFrame") -> "pd.DataFrame":
-    """By how much an episode is right in photos more than in the scene: -1, 0 or 1."""
-    photo = chosen(table[table["seen_in"] == PHOTO])[[*KEY, "right"]]
-    both = chosen(table[table["seen_in"] == SCENE]).merge(photo, on=KEY, suffixes=("", "_photo"))
-    return both.assign(gain=both["right_photo"].astype(float) - both["right"].astype(float))
-
-
-def _gains_of_scene(table: "pd.DataFrame", episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """By how much an episode is right in the scene more than in soft's first touch, likewise."""
-    soft = episodes[episodes["method"] == "soft"][[*KEY, "first_object_correct"]]
-    both = chosen(table[table["seen_in"] == SCENE]).merge(soft, on=KEY)
-    touched = both["first_object_correct"].astype(float)
-    return both.assign(gain=both["right"].astype(float) - touched)
 
 
 KINDS = ("own", "look-alikes", "other objects")
@@ -500,10 +499,8 @@ def final(answers: "pd.DataFrame") -> "pd.DataFrame":
 
 def reading(answers: "pd.DataFrame", name: str) -> "pd.DataFrame":
     """The rows of one of READINGS."""
-    learned_in, token, read_by = READINGS[name]
-    return answers[
-        (answers.learned_in == learned_in) & (answers.token == token) & (answers.read_by == read_by)
-    ]
+    asked = answers[["learned_in", "token", "read_by"]].astype(str)
+    return answers[(asked == READINGS[name]).all(axis=1)]
 
 
 def said_yes(rows: "pd.DataFrame") -> Estimate:
@@ -528,7 +525,7 @@ def curve(answers: "pd.DataFrame") -> "pd.DataFrame":
     lines = []
     for (k, step, kind), part in rows.groupby(["k", "step", kind_of(rows)]):
         about = dict(k=k, step=step, kind=kind, objects=part.object.nunique())
-        lines.append({**about, **_numbers(said_yes(part))})
+        lines.append({**about, **asdict(said_yes(part))})
     return pd.DataFrame(lines)
 
 
@@ -536,15 +533,23 @@ def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     """By object and reading: right, and yes to each kind of photo, `Estimate`s."""
     import pandas as pd
 
-    ends = final(answers)
-    ends = ends[ends.k == k]
     lines = []
-    for name in READINGS:
-        for (suite, obj), part in reading(ends, name).groupby(["suite", "object"], sort=False):
-            kinds = kind_of(part)
+    for name, ends in _read_ends(answers, k):
+        for (suite, obj), part in ends.groupby(["suite", "object"], sort=False):
             line = {"suite": suite, "object": obj, "reading": name, "right": right(part)}
-            lines.append(line | {kind: said_yes(part[kinds == kind]) for kind in KINDS})
+            lines.append(line | _yes_by_kind(part))
     return pd.DataFrame(lines, columns=["suite", "object", "reading", "right", *KINDS])
+
+
+def _read_ends(answers: "pd.DataFrame", k: int) -> "Iterator[tuple[str, pd.DataFrame]]":
+    """The rows after the last step of trainings from `k` photos, by reading."""
+    ends = final(answers)
+    return ((name, reading(ends[ends.k == k], name)) for name in READINGS)
+
+
+def _yes_by_kind(rows: "pd.DataFrame") -> dict[str, Estimate]:
+    kinds = kind_of(rows)
+    return {kind: said_yes(rows[kinds == kind]) for kind in KINDS}
 
 
 def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
@@ -554,17 +559,12 @@ def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    ends = final(answers)
-    ends = ends[ends.k == k]
     lines = []
-    for name in READINGS:
-        part = reading(ends, name)
-        if part.empty:
-            continue
-        kinds = kind_of(part)
-        of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
-        line = {"reading": name, "right": mean_of_tokens(of_objects)}
-        lines.append(line | {kind: said_yes(part[kinds == kind]) for kind in KINDS})
+    for name, part in _read_ends(answers, k):
+        if len(part):
+            of_objects = [right(rows) for _, rows in part.groupby("object", sort=False)]
+            line = {"reading": name, "right": mean_of_tokens(of_objects)}
+            lines.append(line | _yes_by_kind(part))
     return pd.DataFrame(lines, columns=["reading", "right", *KINDS]).set_index("reading")
 
 
@@ -574,11 +574,9 @@ def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
 
     ends = final(reading(answers, "as learned"))
     ends = ends[(ends.k == k) & (kind_of(ends) == "look-alikes")]
-    lines = []
-    for row in ends.itertuples():
-        about = {"suite": row.suite, "object": row.object, "look-alike": row.shown}
-        lines.append({**about, **_numbers(rate(row.yes, row.n))})
-    return pd.DataFrame(lines)
+    lines = ends[["suite", "object", "shown"]].rename(columns={"shown": "look-alike"})
+    numbers = pd.DataFrame(list(map(asdict, rates(ends.yes, ends.n))), lines.index)
+    return lines.join(numbers).reset_index(drop=True)
 
 
 def success_by_token(episodes: "pd.DataFrame", other: str, one: str = "soft") -> "pd.Series":
@@ -637,7 +635,3 @@ def _choices(table: "pd.DataFrame") -> "pd.DataFrame":
         right = share_by(found, "right", OBJECTS).text()
         lines.append({**line, "the model chooses the target": right})
     return pd.DataFrame(lines)
-
-
-def _numbers(found: Estimate) -> dict[str, float | int]:
-    return {"n": found.n, "value": found.value, "low": found.low, "high": found.high}

@@ -16,11 +16,12 @@ to the end. A frame counts for an object when it shows at least VISIBLE_PX pixel
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from vap_core.attend import Attender
 from vap_core.base.types import Boxes, Mask, Rgb, Track, value
@@ -62,8 +63,6 @@ The others are hidden for 3 only. One camera counts as a third.
 """
 Frame = Mapping[str, tuple[Rgb, Mapping[str, Mask]]]
 """Per camera the picture and every object's visible pixels."""
-Tracks = list[tuple[Track, ...]]
-"""The tracks of one frame: a tuple per camera, a track per object."""
 
 
 @value
@@ -102,21 +101,15 @@ def plan(
     Raises: UnknownName for a suite that no registry holds; BadSuite for a damaged list.
     """
     count = {**EPISODES, **(episodes or {})}
-    if suite_names is None:
-        suite_names = list(suites.BENCHMARKS)
     jobs = []
-    for name in suite_names:
+    for name in suites.BENCHMARKS if suite_names is None else suite_names:
         suite = suites.suite(name)
         n_all_hidden = ALL_HIDDEN * 3 // len(suite.cameras)
         for task in suite.tasks:
-            rows = suites.rows(suite.name, task.name, count[suite.name])
-            for i, row in enumerate(rows):
-                hidden: tuple[int, ...] = (HIDDEN,)
-                if i < n_all_hidden:
-                    hidden = tuple(range(1, MOST_HIDDEN + 1))
+            for i, row in enumerate(suites.rows(suite.name, task.name, count[suite.name])):
+                hidden = tuple(range(1, MOST_HIDDEN + 1)) if i < n_all_hidden else (HIDDEN,)
                 kind: Literal["plate", "arm"] = "arm" if i % 4 == 3 else "plate"
-                job = Job(row=row, every=steps_per_frame(row), hidden=hidden, kind=kind)
-                jobs.append(job)
+                jobs.append(Job(row=row, every=steps_per_frame(row), hidden=hidden, kind=kind))
     return jobs
 
 
@@ -127,9 +120,7 @@ def steps_per_frame(row: EpisodeRow) -> int:
 
     Raises: UnknownName for a suite that no registry holds.
     """
-    if suites.suite(row.suite).hz >= 30 and row.rule == "put":
-        return 2
-    return 1
+    return 2 if suites.suite(row.suite).hz >= 30 and row.rule == "put" else 1
 
 
 def track_episode(job: Job, stack: Stack) -> list[TableRow]:
@@ -185,44 +176,38 @@ def track_film(film: Film, job: Job, stack: Stack) -> list[TableRow]:
     if not names:
         return []
     states = _start_tracker(film.frames[0], names, stack)
-    states_before: list[Any] | None = None
+    before: list[Any] = []
     undisturbed = _TrackerRun(stack, names, job, hidden=0)
     for t, frame in enumerate(film.frames[1:], start=1):
         if t == film.start and job.hidden:
-            states_before = copy.deepcopy(states)
+            before = copy.deepcopy(states)
         states = undisturbed.add(states, frame)
     rows = undisturbed.rows()
-    if states_before is None:
-        return rows
-    for n in job.hidden:
-        if film.start + n >= len(film.frames):
-            continue  # the episode was over before the target was shown again
-        disturbed = _TrackerRun(stack, names, job, hidden=n)
-        states = copy.deepcopy(states_before)
-        shown_again = film.frames[film.start + n : film.start + n + AFTER]
-        for frame in (*film.covered[:n], *shown_again):
-            states = disturbed.add(states, frame)
-        rows += disturbed.rows()
+    for n in job.hidden if before else ():
+        shown_again = film.frames[film.start + n :][:AFTER]
+        if shown_again:  # else the episode was over before
+            disturbed, states = _TrackerRun(stack, names, job, hidden=n), copy.deepcopy(before)
+            for frame in (*film.covered[:n], *shown_again):
+                states = disturbed.add(states, frame)
+            rows += disturbed.rows()
     return rows
 
 
+@dataclass
 class _TrackerRun:
     """The tracks of one run of the tracker, frame by frame.
 
     `names` are the tracked objects of each camera; the target is hidden in the first `hidden`
-    frames.
+    frames. `tracks` are by camera and the object's place.
     """
 
-    def __init__(
-        self, stack: Stack, names: Mapping[str, Sequence[str]], job: Job, *, hidden: int
-    ) -> None:
-        self.stack = stack
-        self.names = names
-        self.job = job
-        self.hidden = hidden
-        self.frames: list[Frame] = []
-        self.tracks: list[Tracks] = []
-        self.times_ms: list[float] = []
+    stack: Stack
+    names: Mapping[str, Sequence[str]]
+    job: Job
+    hidden: int
+    frames: list[Frame] = field(default_factory=list)
+    tracks: list[dict[tuple[str, int], Track]] = field(default_factory=list)
+    times_ms: list[float] = field(default_factory=list)
 
     def add(self, states: list[Any], frame: Frame) -> list[Any]:
         """Track the next frame of every camera, and return the tracker's states after it."""
@@ -230,78 +215,68 @@ class _TrackerRun:
         images = [frame[camera][0] for camera, _ in followed]
         start = time.perf_counter()
         states, tracks = self.stack.tracker.step(states, images)
-        took_ms = 1e3 * (time.perf_counter() - start)
-        by_camera: dict[str, dict[int, Track]] = {camera: {} for camera in self.names}
-        for (camera, rows), of_state in zip(followed, tracks, strict=True):
-            for i in rows:
-                by_camera[camera][i] = of_state[i]
+        self.times_ms.append(1e3 * (time.perf_counter() - start) / len(images))
+        by_state = zip(followed, tracks, strict=True)
+        self.tracks.append({(camera, i): of[i] for (camera, rows), of in by_state for i in rows})
         self.frames.append(frame)
-        self.tracks.append(
-            [tuple(by_row[i] for i in sorted(by_row)) for by_row in by_camera.values()]
-        )
-        self.times_ms.append(took_ms / len(images))
         return states
 
     def rows(self) -> list[TableRow]:
         """One row per camera and object."""
-        rows = []
-        for v, (camera, names) in enumerate(self.names.items()):
+        episode = self.job.row
+        rows: list[TableRow] = []
+        for camera, names in self.names.items():
             views = [frame[camera] for frame in self.frames]
             for i, name in enumerate(names):
-                tracks = [of_frame[v][i] for of_frame in self.tracks]
-                scores = _compare_track(views=views, name=name, tracks=tracks, hidden=self.hidden)
-                rows.append(self._row(camera, name, scores))
+                tracks = [of_frame[camera, i] for of_frame in self.tracks]
+                row = {
+                    "suite": episode.suite,
+                    "task": episode.task,
+                    "episode": episode.episode,
+                    "variant": episode.variant,
+                    "camera": camera,
+                    "object": name,
+                    "target": name == episode.target,
+                    "hidden": self.hidden,
+                    "kind": self.job.kind if self.hidden else "",
+                    "every": self.job.every,
+                    **_compare_track(views, name, tracks, self.hidden),
+                    "step_ms": float(np.median(self.times_ms)),
+                    "objects": len(names),
+                    "frames": len(self.frames),
+                }
+                rows.append(row)
         return rows
-
-    def _row(self, camera: str, name: str, scores: TableRow) -> TableRow:
-        episode = self.job.row
-        return {
-            "suite": episode.suite,
-            "task": episode.task,
-            "episode": episode.episode,
-            "variant": episode.variant,
-            "camera": camera,
-            "object": name,
-            "target": name == episode.target,
-            "hidden": self.hidden,
-            "kind": self.job.kind if self.hidden else "",
-            "every": self.job.every,
-            **scores,
-            "step_ms": float(np.median(self.times_ms)),
-            "objects": len(self.names[camera]),
-            "frames": len(self.frames),
-        }
 
 
 def _shown_objects(frame: Frame, category: str) -> dict[str, tuple[str, ...]]:
     """The objects of a category that a frame shows, by camera; cameras without any are left out."""
-    shown = {}
-    for camera, (rgb, masks) in frame.items():
-        names = []
-        for name, mask in masks.items():
-            if get_object(name).category == category and _counts(mask, rgb):
-                names.append(name)
-        if names:
-            shown[camera] = tuple(names)
-    return shown
+    shown = {
+        camera: tuple(
+            name
+            for name, mask in masks.items()
+            if get_object(name).category == category and _counts(mask, rgb)
+        )
+        for camera, (rgb, masks) in frame.items()
+    }
+    return {camera: names for camera, names in shown.items() if names}
 
 
 def _start_tracker(frame: Frame, names: Mapping[str, Sequence[str]], stack: Stack) -> list[Any]:
-    """The tracker's states of `_followed`, from true boxes."""
+    """The tracker's states of `_followed`, from the masks that the segmenter draws from true
+    boxes."""
     by_camera = {}
     for camera, tracked in names.items():
         rgb, masks = frame[camera]
-        by_camera[camera] = _first_masks(rgb=rgb, masks=masks, names=tracked, stack=stack)
-    images = []
-    first_masks = []
-    targets = []
-    for camera, rows in _followed(names, stack):
-        images.append(frame[camera][0])
-        first_masks.append(by_camera[camera])
-        targets.append(rows)
+        boxes = [box for name in tracked if (box := mask_box(masks[name])) is not None]
+        scores = np.ones(len(boxes), np.float32)
+        by_camera[camera] = stack.segmenter(rgb, Boxes(np.stack(boxes), scores, "object"))
+    followed = _followed(names, stack)
+    images = [frame[camera][0] for camera, _ in followed]
+    first_masks = [by_camera[camera] for camera, _ in followed]
     tracker = stack.tracker
     if isinstance(tracker, TargetTracker):
-        return tracker.start_targets(images, first_masks, targets)
+        return tracker.start_targets(images, first_masks, [rows for _, rows in followed])
     return tracker.start(images, first_masks)
 
 
@@ -310,32 +285,15 @@ def _followed(names: Mapping[str, Sequence[str]], stack: Stack) -> list[tuple[st
 
     Where the tracker can, each object is followed by itself.
     """
-    followed = []
-    for camera, tracked in names.items():
-        rows = list(range(len(tracked)))
-        if isinstance(stack.tracker, TargetTracker):
-            followed += [(camera, [row]) for row in rows]
-        else:
-            followed.append((camera, rows))
-    return followed
-
-
-def _first_masks(
-    *, rgb: Rgb, masks: Mapping[str, Mask], names: Iterable[str], stack: Stack
-) -> Bool[np.ndarray, "n h w"]:
-    """The masks that the segmenter draws from the true boxes of objects."""
-    boxes = []
-    for name in names:
-        box = mask_box(masks[name])
-        if box is not None:
-            boxes.append(box)
-    scores = np.ones(len(boxes), np.float32)
-    true_boxes = Boxes(np.stack(boxes), scores, "object")
-    return stack.segmenter(rgb, true_boxes)
+    alone = isinstance(stack.tracker, TargetTracker)
+    return [
+        (camera, rows)
+        for camera, tracked in names.items()
+        for rows in ([[i] for i in range(len(tracked))] if alone else [[*range(len(tracked))]])
+    ]
 
 
 def _compare_track(
-    *,
     views: Sequence[tuple[Rgb, Mapping[str, Mask]]],
     name: str,
     tracks: Sequence[Track],
@@ -348,45 +306,33 @@ def _compare_track(
     has an IoU below WRONG; `back_after` how many of the frames that show the object, once the first
     `hidden` are over, pass before the track is on it again (None: never). `gone` counts the frames
     in which nothing of the object shows, and `false_px` is the mean size of the track in them.
+    `iou_over_time` is the IoU at BINS points of normalised time; None in frames that do not show
+    the object.
     """
-    shown = np.zeros(len(views), bool)
+    shown = np.array([_counts(masks[name], rgb) for rgb, masks in views], bool)
     iou = np.full(len(views), np.nan)
     false_px = []
-    n_lost = 0
-    n_wrong = 0
-    for t, ((rgb, masks), track) in enumerate(zip(views, tracks, strict=True)):
+    for t, ((_, masks), track) in enumerate(zip(views, tracks, strict=True)):
         true = masks[name]
         mask = np.zeros_like(true) if track.mask is None else track.mask
         if not true.any():
-            n_px = int(mask.sum())
-            false_px.append(n_px)
-        if _counts(true, rgb):
-            shown[t] = True
+            false_px.append(int(mask.sum()))
+        if shown[t]:
             iou[t] = mask_iou(mask, true)
-            n_lost += track.mask is None
-            n_wrong += track.mask is not None and iou[t] < WRONG
-    shown_iou = iou[shown]
+    there = np.array([track.mask is not None for track in tracks], bool)
     again = np.flatnonzero(iou[hidden:][shown[hidden:]] > KEPT)
+    points = np.linspace(0, len(iou) - 1, BINS).round().astype(int)
     return {
         "shown": int(shown.sum()),
-        "mean_iou": float(shown_iou.mean()) if len(shown_iou) else None,
-        "kept": bool(shown_iou[-1] > KEPT) if len(shown_iou) else None,
-        "lost": n_lost,
-        "wrong": int(n_wrong),
+        "mean_iou": float(iou[shown].mean()) if shown.any() else None,
+        "kept": bool(iou[shown][-1] > KEPT) if shown.any() else None,
+        "lost": int((shown & ~there).sum()),
+        "wrong": int((there & (iou < WRONG)).sum()),
         "gone": len(false_px),
         "false_px": float(np.mean(false_px)) if false_px else None,
         "back_after": int(again[0]) if len(again) else None,
-        "iou_over_time": _sample_over_time(iou),
+        "iou_over_time": [None if np.isnan(each) else float(each) for each in iou[points]],
     }
-
-
-def _sample_over_time(iou: Float64[np.ndarray, " t"]) -> list[float | None]:
-    """The IoU at BINS points of normalised time; None in frames that do not show the object."""
-    points = np.linspace(0, len(iou) - 1, BINS)
-    samples: list[float | None] = []
-    for sample in iou[points.round().astype(int)]:
-        samples.append(None if np.isnan(sample) else float(sample))
-    return samples
 
 
 def _counts(mask: Mask, rgb: Rgb) -> bool:
@@ -419,8 +365,7 @@ def measure(stack: Stack, repeat: int = 25) -> list[TableRow]:
     """
     import torch
 
-    row = suites.rows(SUITE, TASK, 1)[0]
-    models = [place.model for place in row.placements]
+    models = [place.model for place in suites.rows(SUITE, TASK, 1)[0].placements]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -428,32 +373,23 @@ def measure(stack: Stack, repeat: int = 25) -> list[TableRow]:
             times_ms = _time_in_turn(_works(stack, scene), repeat)
     finally:
         torch.set_num_threads(threads)
-    rows = []
+    rows: list[TableRow] = []
     for name, of_work_ms in times_ms.items():
-        low, middle, high = np.percentile(of_work_ms, [25, 50, 75])
-        row_of_work: TableRow = {
-            "what": name,
-            "ms": float(middle),
-            "low_ms": float(low),
-            "high_ms": float(high),
-            "rounds": repeat,
-        }
-        rows.append(row_of_work)
+        low, middle, high = np.percentile(of_work_ms, [25, 50, 75]).tolist()
+        row = {"what": name, "ms": middle, "low_ms": low, "high_ms": high, "rounds": repeat}
+        rows.append(row)
     return rows
 
 
 def _time_in_turn(works: Mapping[str, Work], repeat: int) -> dict[str, list[float]]:
     """Milliseconds of every piece of work in each round, after one round to warm up."""
-    times_ms: dict[str, list[float]] = {}
-    for name, work in works.items():
-        work()
-        times_ms[name] = []
-    for _ in range(repeat):
+    times_ms: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeat + 1):
         for name, work in works.items():
             start = time.perf_counter()
             work()
             times_ms[name].append(1e3 * (time.perf_counter() - start))
-    return times_ms
+    return {name: of_work[1:] for name, of_work in times_ms.items()}
 
 
 def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
@@ -468,8 +404,14 @@ def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
     views = {camera: observation.images[camera]}
     personal, _ = registered_object(stack, row.target, USUAL_K)
     attender = Attender(stack, {row.target: personal})
-    track_step = _track_step(stack, film, camera)
+    rgb, masks = film[0][camera]
+    states, turn = stack.tracker.start([rgb], [np.stack(list(masks.values()))]), count(1)
     state = policy.start(np.random.default_rng(0))
+
+    def track() -> None:
+        """The next frame of the film, which begins again at its end."""
+        nonlocal states
+        states, _ = stack.tracker.step(states, [film[next(turn) % len(film)][camera][0]])
 
     def plan() -> object:
         policy_input = PolicyInput(observation.images, row.instruction, observation.state)
@@ -477,22 +419,7 @@ def _works(stack: Stack, scene: Scene) -> dict[str, Work]:
 
     return {
         START: lambda: attender.start(views, row.instruction),
-        STEP: track_step,
+        STEP: track,
         PASS: lambda: stack.encoder([views[camera]]),
         POLICY: plan,
     }
-
-
-def _track_step(stack: Stack, film: Sequence[Frame], camera: str) -> Work:
-    """A step of the tracker on the next frame of a film, which begins again at its end."""
-    rgb, masks = film[0][camera]
-    all_masks = list(masks.values())
-    states = stack.tracker.start([rgb], [np.stack(all_masks)])
-    t = 0
-
-    def step() -> None:
-        nonlocal states, t
-        t = (t + 1) % len(film)
-        states, _ = stack.tracker.step(states, [film[t][camera][0]])
-
-    return step

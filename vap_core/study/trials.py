@@ -208,14 +208,9 @@ class Study:
             list without a checksum; BadObject for a damaged scan; BadStudy for an arm that
             `describe` refuses.
         """
-        digests = {}
-        for suite, _ in self.tasks:
-            if suites.has_list(suite):
-                digests[suite] = suites.digest(suite)
-        checkpoints_used = set()
-        for suite, _ in self.tasks:
-            checkpoints_used.add(self.checkpoint(suite))
-        names = sorted(checkpoints_used - {""})
+        named = [suite for suite, _ in self.tasks]
+        digests = {suite: suites.digest(suite) for suite in named if suites.has_list(suite)}
+        names = sorted(set(map(self.checkpoint, named)) - {""})
         fingerprints = [checkpoints.fingerprint(name) for name in names]
         about = asdict(self)
         if self.temperature is None:  # digests are those of versions without it
@@ -235,9 +230,7 @@ class Study:
         about |= checksums(self.stack if self.uses_stack() else "embedded")
         if digests and self.seed + self.seeds > 1:
             about["starts"] = starts.settings()
-        own_motions = {}
-        if self.policy == "scripted":
-            own_motions = world.own_motions(suite for suite, _ in self.tasks)
+        own_motions = world.own_motions(named) if self.policy == "scripted" else {}
         if own_motions:
             about["motions"] = own_motions
         listed = [(suite, self.rows(suite, task)) for suite, task in self.tasks]
@@ -364,8 +357,7 @@ def register_personal(study: Study, bank: Path) -> None:
             obj = replace(obj, description=described.description)
         spaces = {token_space(method) for method in study.methods}
         if spaces & {"copied", "aligned"}:
-            initialised_from = checkpoints.config_field(study.checkpoint(suite), "vlm")
-            teach(rows, bank, initialised_from)
+            teach(rows, bank, checkpoints.config_field(study.checkpoint(suite), "vlm"))
         if "own" in spaces:
             teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
         if obj is not known.get(target):
@@ -455,8 +447,7 @@ def _policy(
     )
     if not needs_token(method):
         return policy
-    embedding = _token_embedding(study, method, row, bank)
-    return policy.with_tokens({WORD: embedding})
+    return policy.with_tokens({WORD: _token_embedding(study, method, row, bank)})
 
 
 def _token_embedding(
@@ -490,10 +481,7 @@ def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
     6.
     """
     first = rows[0]
-    listed = []
-    for row in study.rows(first.suite, first.task):
-        if row.variant == first.variant:
-            listed.append(row)
+    listed = [row for row in study.rows(first.suite, first.task) if row.variant == first.variant]
     placed = models_of(rows)
     names = [name for name in models_of([*listed, *rows]) if name in placed]
     key = (first.suite, tuple(names), first.variant, study.robots)
@@ -528,10 +516,8 @@ def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
     """
     succeeded: dict[int, bool] = {}
     for variant in dict.fromkeys(row.variant for row in rows):
-        numbers = [i for i, row in enumerate(rows) if row.variant == variant]
-        part = [rows[i] for i in numbers]
-        for i, good in zip(numbers, _try_rows(part), strict=True):
-            succeeded[i] = good
+        part = {i: row for i, row in enumerate(rows) if row.variant == variant}
+        succeeded |= zip(part, _try_rows([*part.values()]), strict=True)
     return tuple(succeeded[i] for i in range(len(rows)))
 
 
@@ -559,19 +545,13 @@ def check_feasible(study: Study) -> tuple[Tried, ...]:
     found = []
     for suite, task in study.tasks:
         rows = study.rows(suite, task)
-        failed = []
-        for row, good in zip(rows, feasible(rows), strict=True):
-            if not good:
-                failed.append(_name(row))
-        tried = Tried(where=f"{suite}/{task}", n=len(rows), failed=tuple(failed))
+        failed = [row for row, good in zip(rows, feasible(rows), strict=True) if not good]
+        names = tuple(f"{r.episode} (seed {r.seed})" if r.seed else str(r.episode) for r in failed)
+        tried = Tried(where=f"{suite}/{task}", n=len(rows), failed=names)
         if len(failed) == len(rows):
             raise BadStudy(f"{tried}. {_remedy(study)}")
         found.append(tried)
     return tuple(found)
-
-
-def _name(row: EpisodeRow) -> str:
-    return f"{row.episode} (seed {row.seed})" if row.seed else str(row.episode)
 
 
 def _remedy(study: Study) -> str:

@@ -263,7 +263,7 @@ SAME_OBJECT_IOU = 0.6
 29 crops of 40 in an unfamiliar view and 8 of 9 in a familiar one."""
 TILED_PX = 1_000_000
 """From so many pixels on an unfamiliar view is looked at in tiles, too. Of 60 packages pasted into
-photos of 1920 x 1080, 4 to 13 % of the width, 52 are among the 40 boxes, without tiles 50."""
+photos of 1920 x 1080, 4 to 13 % of the width, 55 are among the 40 boxes, without tiles 50."""
 CUT_PX = 2
 """A box that comes this near to a tile's edge may be cut by it."""
 REFERENCE_SHARE = 0.95
@@ -297,10 +297,7 @@ class OpenDetector:
     def __call__(
         self, images: Sequence[Rgb], phrase: str, threshold: float | None = None
     ) -> list[Boxes]:
-        """The proposals of each image; `threshold` bounds the proposer's score.
-
-        Those of unfamiliar views have priors.
-        """
+        """The proposals of each image; `threshold` bounds the proposer's score."""
         if threshold is None:
             threshold = LEAST_SCORE
         found = []
@@ -314,14 +311,11 @@ class OpenDetector:
             xyxy, score = (np.concatenate(part) for part in zip(*parts, strict=True))
             alone = suppress_overlaps(xyxy, score, iou=SAME_OBJECT_IOU, most=most)
             xyxy, score = xyxy[alone], score[alone]
-            evidence = None
             if familiar:
                 kept = agreed(xyxy, named)
                 kept[:MOST_FAMILIAR] = True
                 xyxy, score = xyxy[kept], score[kept]
-            else:
-                evidence = prior(xyxy, score, named)
-            found.append(Boxes(xyxy, score, phrase, prior=evidence, familiar=familiar))
+            found.append(Boxes(xyxy, score, phrase, familiar=familiar))
         return found
 
     def _in_tile(self, image: Rgb, near: tuple[int, int], threshold: float, most: int) -> Found:
@@ -333,21 +327,23 @@ class OpenDetector:
         whole = ((xyxy[:, :2] > CUT_PX) & (xyxy[:, 2:] < size - CUT_PX)).all(axis=1)
         return xyxy[whole] + np.array([x, y, x, y], np.float32), score[whole]
 
-    def reference_boxes(self, photo: Rgb, phrase: str, threshold: float) -> Boxes:
-        """Boxes of any size, with their priors.
+    def reference_boxes(
+        self, photo: Rgb, phrase: str, threshold: float
+    ) -> tuple[Boxes, Float32[np.ndarray, " n"]]:
+        """Boxes of any size, and the evidence of score and phrase for each.
 
         Where the phrase head knows the object, the likeliest box that it agrees with is its own.
         """
         xyxy, score = self.propose(photo, threshold, MOST_UNFAMILIAR, REFERENCE_SHARE)
         named = self._named(photo, phrase)
-        evidence = prior(xyxy, score, named)
+        evidence = OBJECTNESS * np.log(score + np.float32(1e-3)) + AGREEMENT * agreed(xyxy, named)
         familiar = _is_familiar(named)
         if familiar:
             overlap = box_iou(xyxy, named.xyxy[:1])[:, 0]
             agreeing = np.flatnonzero(overlap >= AGREEMENT_IOU)
             if len(agreeing):
                 xyxy[agreeing[evidence[agreeing].argmax()]] = named.xyxy[0]
-        return Boxes(xyxy=xyxy, score=score, phrase=phrase, prior=evidence, familiar=familiar)
+        return Boxes(xyxy, score, phrase, familiar=familiar), evidence.astype(np.float32)
 
     def is_familiar(self, image: Rgb, phrase: str) -> bool:
         """Whether the image is of the world that the phrase head was trained on."""
@@ -356,15 +352,6 @@ class OpenDetector:
     def _named(self, image: Rgb, phrase: str) -> Boxes:
         """The boxes of the phrase head, the unsure ones too."""
         return self.by_category([image], phrase, PHRASE_FLOOR)[0]
-
-
-def prior(
-    xyxy: Float32[np.ndarray, "n 4"], score: Float32[np.ndarray, " n"], named: Boxes
-) -> Float32[np.ndarray, " n"]:
-    """The evidence for each proposal besides the references', in units of cosine."""
-    objectness = np.log(score + np.float32(1e-3))
-    evidence = OBJECTNESS * objectness + AGREEMENT * agreed(xyxy, named)
-    return evidence.astype(np.float32)
 
 
 def agreed(xyxy: Float32[np.ndarray, "n 4"], named: Boxes) -> Bool[np.ndarray, " n"]:

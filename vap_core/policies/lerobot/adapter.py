@@ -96,7 +96,7 @@ class LeRobot:
         postprocessor: Any,
         label: str = "lerobot",
     ) -> None:
-        config: Any = policy.config
+        config = policy.config
         self.policy = policy.eval().requires_grad_(False)
         self.preprocessor = preprocessor
         self.postprocessor = postprocessor
@@ -223,7 +223,7 @@ class LeRobot:
 
     def cameras(self) -> list[str]:
         """The names of our cameras, in the order in which the policy reads them."""
-        config: Any = self.policy.config
+        config = self.policy.config
         return [self._camera(key) for key in config.image_features if not key.startswith(EMPTY)]
 
     def prepare(
@@ -242,7 +242,7 @@ class LeRobot:
 
     def _watching(self, batch: dict[str, Any]) -> AbstractContextManager[None]:
         """Reports the attention of a call where somebody observes it."""
-        config: Any = self.policy.config
+        config = self.policy.config
         pictures = [batch[key] for key in config.image_features if key in batch]
         if not (self.attends and attention_observed() and can_watch(self.policy, pictures)):
             return nullcontext()
@@ -294,7 +294,7 @@ class LeRobot:
         return self.renamed.get(key, key).removeprefix(IMAGE)
 
     def _noise(self, states: Sequence[LeRobotState]) -> torch.Tensor:
-        config: Any = self.policy.config
+        config = self.policy.config
         shape = (config.chunk_size, config.max_action_dim)
         seeded = [torch.Generator().manual_seed(state.seed) for state in states]
         noise = [torch.randn(shape, generator=generator) for generator in seeded]
@@ -313,10 +313,9 @@ def load_policy(
         that it scales by, does not end with exactly the file's weights, or has no temperature to
         set.
     """
-    folder = locate(checkpoint)
-    policy, preprocessor, postprocessor = build(folder, device)
+    policy, preprocessor, postprocessor = build(locate(checkpoint), device)
     if temperature is not None:
-        config: Any = policy.config
+        config = policy.config
         if not hasattr(config, "temperature"):
             raise BadPolicy(
                 f"load: {checkpoint} has no temperature; leave it out, or take a mini-pi0, whose "

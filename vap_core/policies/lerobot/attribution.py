@@ -166,10 +166,10 @@ def layer_effects(folder: Path) -> "pd.DataFrame":
 
 def noise_input(policy: LeRobot, rng: np.random.Generator, side: int) -> PolicyInput:
     """Noise as pictures (`side` px) and state, under a real instruction."""
-    images = {}
-    for key in policy.wanted:
-        if key != STATE:
-            rgb = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
-            images[key.removeprefix(IMAGE)] = rgb
+    images = {
+        key.removeprefix(IMAGE): rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
+        for key in policy.wanted
+        if key != STATE
+    }
     state = rng.normal(size=policy.wanted[STATE]).astype(np.float32)
     return PolicyInput(images, "pick up the red cup", state)

@@ -193,8 +193,7 @@ def deciding_files(folder: Path) -> list[Path]:
 def _steps(file: Path) -> list[dict[str, Any]]:
     """The steps of a processor pipeline. Raises: BadPolicy."""
     try:
-        steps = parse_json(file.read_text())["steps"]
-        return [dict(step) for step in steps]
+        return [dict(step) for step in parse_json(file.read_text())["steps"]]
     except (ValueError, KeyError, TypeError) as error:
         raise BadPolicy(
             f"load: {file} is no processor pipeline ({type(error).__name__}); save it again with "

@@ -268,5 +268,4 @@ def _weights(
     n_heads = query.shape[2] // key.shape[2]
     keys = key.float().repeat_interleave(n_heads, dim=2).transpose(1, 2)
     scores = query.float().transpose(1, 2) @ keys.transpose(2, 3) * query.shape[-1] ** -0.5
-    masked = torch.where(mask[:, None], scores, torch.finfo(scores.dtype).min)
-    return masked.softmax(-1)
+    return torch.where(mask[:, None], scores, torch.finfo(scores.dtype).min).softmax(-1)

@@ -168,14 +168,14 @@ def _build(folder: Path, device: str) -> tuple["PreTrainedPolicy", Any, Any]:
     # a file does not decide what is looked up on the network
     offline = patch("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with _silence(), no_code, offline:
-        config: Any = PreTrainedConfig.from_pretrained(folder)
+        config = PreTrainedConfig.from_pretrained(folder)
         config.device = device
         # the file's weights replace those that these options load
         if getattr(config, "pretrained_backbone_weights", None):
             config.pretrained_backbone_weights = None
         if getattr(config, "load_vlm_weights", None):
             config.load_vlm_weights = False
-        policy_class: Any = policies.factory.get_policy_class(config.type)
+        policy_class = policies.factory.get_policy_class(config.type)
         policy = policy_class.from_pretrained(folder, config=config)
         preprocessor, postprocessor = policies.make_pre_post_processors(
             config,

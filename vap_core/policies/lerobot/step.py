@@ -16,7 +16,7 @@ import fnmatch
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -301,8 +301,7 @@ def attach(checkpoint: str | Path, out: Path, memory: Path, **options: Any) -> P
         raise BadPolicy(f"attach: {source} has VAP attached; give the checkpoint without it.")
     refuse_code(source)
     step._load()  # what would fail at the first picture fails here
-    entry = {"class": STEP_CLASS, "config": step.get_config()}
-    pipeline["steps"].insert(place, entry)
+    pipeline["steps"].insert(place, {"class": STEP_CLASS, "config": step.get_config()})
     made = False
     try:
         out.mkdir(parents=True)
@@ -438,7 +437,7 @@ class VapEnvConfig(EnvConfig):
         def make_env() -> gymnasium.Env:
             return LeRobotEnv(self.suite.name, task, **self.gym_kwargs)
 
-        makers: list[Callable[[], gymnasium.Env]] = [make_env] * n_envs
+        makers = [make_env] * n_envs
         if use_async_envs and n_envs > 1:
             return _LazyAsyncVectorEnv(makers)
         makers = list(map(freeze_after_episode_end, makers))

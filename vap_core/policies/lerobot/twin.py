@@ -142,8 +142,7 @@ class VapSo101Twin(Robot):
             if f"{joint}.pos" in action:
                 goals[i] = float(action[f"{joint}.pos"])
         moves = np.deg2rad(goals[:-1]) - command.joints
-        gripper = float(np.clip(goals[-1] / OPEN, 0.0, 1.0))
-        env.step(np.array([*moves, gripper], np.float32))
+        env.step(np.array([*moves, float(np.clip(goals[-1] / OPEN, 0.0, 1.0))], np.float32))
         judge = self._judge
         assert judge is not None
         if not judge.done and judge.steps < self.row.max_steps:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain
+from itertools import batched, chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -242,16 +242,14 @@ class _Question:
         from torch.nn.functional import interpolate
 
         side = self.vlm.config.image_resolution
-        parts = []
+
+        def resized(photo: Rgb) -> torch.Tensor:
+            image = torch.from_numpy(photo).permute(2, 0, 1)[None].float() / 255
+            return interpolate(image, side, mode="bilinear", antialias=True)
+
         with torch.no_grad():
-            for first in range(0, len(photos), EMBEDDED_AT_ONCE):
-                resized = []
-                for photo in photos[first : first + EMBEDDED_AT_ONCE]:
-                    image = torch.from_numpy(photo).permute(2, 0, 1)[None].float() / 255
-                    scaled = interpolate(image, side, mode="bilinear", antialias=True)
-                    resized.append(scaled)
-                parts.append(self.vlm.embed_images(torch.cat(resized)))
-            return torch.cat(parts)
+            parts = batched(map(resized, photos), EMBEDDED_AT_ONCE)
+            return torch.cat([self.vlm.embed_images(torch.cat(part)) for part in parts])
 
     def ask(self, patches: "torch.Tensor") -> "torch.Tensor":
         """By how much "yes" scores higher than "no", for every photo."""

@@ -58,8 +58,7 @@ class MiniVlm(nn.Module):
         The second result is the penultimate layer's states of the patches. `mask` tells tokens of
         the question from padding.
         """
-        words = self.towers.embed_language_tokens(tokens)
-        return self.read(patches, words, mask, answers)
+        return self.read(patches, self.towers.embed_language_tokens(tokens), mask, answers)
 
     def read(
         self,
@@ -133,8 +132,7 @@ def load_vlm(folder: Path) -> MiniVlm:
             "python -m vap_core train vlm"
         )
     try:
-        config = PreTrainedConfig.from_pretrained(folder)
-        vlm = MiniVlm(cast(MiniPI0Config, config))
+        vlm = MiniVlm(cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder)))
         vlm.towers.load_state_dict(load_file(folder / WEIGHTS))
     except BadPolicy:  # it says its own remedy
         raise
@@ -155,8 +153,7 @@ def load_from_policy(folder: Path) -> MiniVlm:
     Raises: BadPolicy.
     """
     try:
-        config = PreTrainedConfig.from_pretrained(folder)
-        vlm = MiniVlm(cast(MiniPI0Config, config))
+        vlm = MiniVlm(cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder)))
         weights = {
             name.removeprefix(IN_POLICY): tensor
             for name, tensor in load_file(folder / "model.safetensors").items()

@@ -398,8 +398,7 @@ class Scripted:
         rows: list[list[float]] = []
         for _ in range(self.execute):
             delta = GAIN * (aim - hand)
-            length = float(np.linalg.norm(delta))
-            delta *= min(1.0, longest / max(length, 1e-9))
+            delta *= min(1.0, longest / max(float(np.linalg.norm(delta)), 1e-9))
             hand = hand + delta
             if self.control == "ee":
                 rows.append([*delta, 0.0, 0.0, 0.0, opening])

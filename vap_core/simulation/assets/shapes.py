@@ -121,8 +121,7 @@ def rotation_matrix(x: Number = 0, y: Number = 0, z: Number = 0) -> np.ndarray:
     cos_z, sin_z = np.cos(z), np.sin(z)
     about_x = np.array([[1, 0, 0], [0, cos_x, -sin_x], [0, sin_x, cos_x]])
     about_y = np.array([[cos_y, 0, sin_y], [0, 1, 0], [-sin_y, 0, cos_y]])
-    about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    return np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]]) @ about_y @ about_x
 
 
 def area_vectors(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:

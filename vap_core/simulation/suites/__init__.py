@@ -110,10 +110,6 @@ def has_list(name: str) -> bool:
     return is_listed(name) or _find_own(name) is not None
 
 
-def is_development(name: str) -> bool:
-    return is_listed(name) and list_name(name).endswith(DEVELOPMENT)
-
-
 def digest(name: str) -> str:
     """The sha256 of a suite's list. Raises: UnknownName; BadSuite."""
     own_suite = _find_own(name)

@@ -91,8 +91,7 @@ def scattered(
     fixed: Sequence[tuple[Spot, float]] = (),
 ) -> tuple[Placement, ...]:
     """Each model anywhere in an area at a random yaw; distances as in `scatter`."""
-    radii = list(map(radius_m, models))
-    spots = scatter(rng, area, radii, fixed=fixed, gap_m=gap_m)
+    spots = scatter(rng, area, list(map(radius_m, models)), fixed=fixed, gap_m=gap_m)
     return tuple(place_at_random_yaws(rng, models, spots))
 
 

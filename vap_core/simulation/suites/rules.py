@@ -96,8 +96,7 @@ class Judge:
         for name in (*truth.touched, *sorted(moved)):
             if name in self.start_world and name not in (*order, self.row.goal):
                 order.append(name)
-        held = CONDITIONS[self.row.rule](self, truth, tuple(order))
-        run = self.run + 1 if held else 0
+        run = self.run + 1 if CONDITIONS[self.row.rule](self, truth, tuple(order)) else 0
         after = replace(
             self,
             now=truth,
@@ -221,8 +220,7 @@ def _put(judge: Judge, truth: Truth, order: Names) -> bool:
     goal = judge.row.goal
     partners = truth.contacts.get(target, frozenset())
     stand = truth.objects_world[goal]
-    pose = truth.objects_world[target]
-    foot = _lowest_m(pose, judge.sizes_m[target]) - float(stand[2])
+    foot = _lowest_m(truth.objects_world[target], judge.sizes_m[target]) - float(stand[2])
     middle = _middle_of(judge, truth, target)
     reach = _half_diagonal_m(judge.sizes_m[goal]) + OVER_M
     return (

@@ -57,8 +57,7 @@ class Suite:
         for task in self.tasks:
             if task.name == name:
                 return task
-        names = [task.name for task in self.tasks]
-        raise one_of(f"suite {self.name}: task", name, names)
+        raise one_of(f"suite {self.name}: task", name, [task.name for task in self.tasks])
 
     def row(
         self,

@@ -10,7 +10,9 @@ import re
 import struct
 from base64 import b64decode
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ HARMLESS = re.compile(r"KHR_(materials_\w+|lights_\w+|xmp\w*|animation_pointer)"
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 UBYTE, FLOAT = 5121, 5126
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TRIANGLES, STRIP, FAN = 4, 5, 6
 REPEAT = 10497
 CLAMPED = (
@@ -78,14 +81,12 @@ def plain_glb(path: Path, find: Callable[[str], bytes]) -> bytes:
     """
     data = path.read_bytes()
     magic, _, _, length, kind = struct.unpack_from("<4s4I", data)
-    if magic != b"glTF" or kind != 0x4E4F534A:
+    if magic != b"glTF" or kind != JSON_CHUNK:
         raise BadObject(f"objects: {path} is no binary glTF 2 file; export it again as GLB.")
     scene = parse_json(data[20 : 20 + length])
-    blob = bytearray(data[28 + length :])
     _refuse_unread(path, scene)
-    given, sources = scene.get("materials", []), dict(scene)
-    scene |= {"materials": [], "textures": [], "images": []}
-    scene.setdefault("bufferViews", [])
+    plain = {"bufferViews": [], **scene, "materials": [], "textures": [], "images": []}
+    glb = _Glb(path, find, plain, bytearray(data[28 + length :]), scene)
     known: dict[str, int] = {}
     for mesh in scene.get("meshes", []):
         for part in mesh["primitives"]:
@@ -93,47 +94,46 @@ def plain_glb(path: Path, find: Callable[[str], bytes]) -> bytes:
                 continue
             attributes = part["attributes"]
             if "COLOR_0" in attributes:
-                colours = _read(path, scene, blob, attributes["COLOR_0"])
+                colours = shares(glb.read(attributes["COLOR_0"]), path, "vertex colours")
                 rgba = np.ones((len(colours), 4))
-                rgba[:, : colours.shape[1]] = shares(colours, path, "vertex colours")
+                rgba[:, : colours.shape[1]] = colours
                 rgba[:, :3] = to_srgb(rgba[:, :3])
                 rows = np.round(255 * rgba).astype(np.uint8)
-                attributes["COLOR_0"] = _append(scene, blob, rows, UBYTE, normalized=True)
-            material = given[part["material"]] if "material" in part else {}
-            _place_texture(path, scene, blob, attributes, material, sources)
+                attributes["COLOR_0"] = glb.append(rows, UBYTE, normalized=True)
+            material = scene["materials"][part["material"]] if "material" in part else {}
+            glb.place_texture(attributes, material)
             about = json.dumps({**material, "name": "", "doubleSided": False}, sort_keys=True)
             if about not in known:
-                known[about] = len(scene["materials"])
-                scene["materials"].append(_plain(path, scene, blob, material, sources, find))
+                known[about] = len(plain["materials"])
+                plain["materials"].append(glb.plain_material(material))
             part["material"] = known[about]
-    blob += bytes(-len(blob) % 4)
-    if scene.get("buffers"):
-        scene["buffers"][0]["byteLength"] = len(blob)
-    text = json.dumps(scene).encode()
+    glb.add(b"")
+    if plain.get("buffers"):
+        plain["buffers"][0]["byteLength"] = len(glb.blob)
+    text = json.dumps(plain).encode()
     text += b" " * (-len(text) % 4)
-    whole = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob))
-    whole += struct.pack("<II", len(text), 0x4E4F534A) + text
-    return whole + struct.pack("<II", len(blob), 0x004E4942) + bytes(blob)
+    whole = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(glb.blob))
+    for chunk, kind in ((text, JSON_CHUNK), (glb.blob, BINARY_CHUNK)):
+        whole += struct.pack("<II", len(chunk), kind) + chunk
+    return whole
 
 
 def _refuse_unread(path: Path, scene: dict[str, Any]) -> None:
     """Raises: BadObject for what changes the form or the base colour, and is not read here."""
-    named = {*scene.get("extensionsUsed", []), *scene.get("extensionsRequired", [])}
-    named |= set(_extensions(scene))
-    unread = sorted(
-        name for name in named - {TRANSFORM} if name == GLOSSY or not HARMLESS.fullmatch(name)
-    )
+    declared = [scene.get(f"extensions{part}", []) for part in ("Used", "Required")]
+    named = set(chain(*declared, _extensions(scene))) - {TRANSFORM}
+    unread = sorted(name for name in named if name == GLOSSY or not HARMLESS.fullmatch(name))
     meshes, nodes = scene.get("meshes", []), scene.get("nodes", [])
     placed = [(node, meshes[node["mesh"]]) for node in nodes if "mesh" in node]
-    parts = [part for mesh in meshes for part in mesh["primitives"]]
-    if any("sparse" in accessor for accessor in scene.get("accessors", [])):
-        unread.append("sparse accessors")
-    if any("skin" in node for node, _ in placed):
-        unread.append("a skin (apply the armature)")
-    if any(any(node.get("weights") or mesh.get("weights") or ()) for node, mesh in placed):
-        unread.append("weights of morph targets (apply the shape keys)")
-    if any(part.get("mode") == FAN for part in parts):
-        unread.append("triangle fans")
+    weights = [each.get("weights") or () for pair in placed for each in pair]
+    modes = [part.get("mode") for mesh in meshes for part in mesh["primitives"]]
+    flaws = {
+        "sparse accessors": any("sparse" in each for each in scene.get("accessors", [])),
+        "a skin (apply the armature)": any("skin" in node for node, _ in placed),
+        "weights of morph targets (apply the shape keys)": any(map(any, weights)),
+        "triangle fans": FAN in modes,
+    }
+    unread += [flaw for flaw, there in flaws.items() if there]
     if unread:
         raise BadObject(
             f"objects: {path} uses {', '.join(unread)}, which is not read here; export it again "
@@ -150,164 +150,138 @@ def _extensions(part: Any) -> Iterator[str]:
             yield from _extensions(inner)
 
 
-def _plain(
-    path: Path,
-    scene: dict[str, Any],
-    blob: bytearray,
-    material: dict[str, Any],
-    sources: dict[str, Any],
-    find: Callable[[str], bytes],
-) -> dict[str, Any]:
-    """A material of one factor or one opaque picture in sRGB.
+@dataclass
+class _Glb:
+    """A file on its way to a plain one: `scene` and its numbers; `given` is what it said."""
 
-    What it gives off is added to its base colour. Grey stands behind what is transparent, as in
-    photos, unless the material says that it is opaque.
-    """
-    surface = material.get("pbrMetallicRoughness", {})
-    factor = shares(surface.get("baseColorFactor", [1.0] * 4), path, "a colour's factor")
-    glow = np.array(material.get("emissiveFactor", [0.0] * 3), np.float32)
-    glow *= material.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0)
-    textures = surface.get("baseColorTexture"), material.get("emissiveTexture")
-    found = [_picture(path, sources, blob, each, find) for each in textures[: 1 + glow.any()]]
-    sizes = [each.shape[1::-1] for each in found if each is not None] or [(1, 1)]
-    pictures = [Image.new("RGBA", (1, 1), "white") if each is None else Image.fromarray(each)
-                for each in found]  # fmt: skip
-    rgba, *shining = (np.array(picture.resize(sizes[0])) for picture in pictures)
-    rgb, seen = rgba[..., :3], rgba[..., 3] / 255 * factor[3]
-    if shining or (factor[:3] != 1).any():
-        light = to_linear(np.arange(256) / 255).astype(np.float32)
-        total = light[rgb] * factor[:3].astype(np.float32)
-        total += sum(light[each[..., :3]] * glow for each in shining)
-        rgb = np.round(255 * to_srgb(total)).astype(np.uint8)
-    mode = material.get("alphaMode", "OPAQUE")
-    if mode == "MASK":
-        seen = 1.0 * (seen >= material.get("alphaCutoff", 0.5) - 1e-6)
-    if mode != "OPAQUE" and (seen < 1).any():
-        opacity = Image.fromarray(np.round(255 * seen).astype(np.uint8))
-        grey = Image.new("RGB", sizes[0], (BEHIND,) * 3)
-        rgb = np.array(Image.composite(Image.fromarray(rgb), grey, opacity))
-    if all(each is None for each in found):
-        return {"pbrMetallicRoughness": {"baseColorFactor": [*(rgb[0, 0] / 255).tolist(), 1.0]}}
-    blob += bytes(-len(blob) % 4)
-    bitmap = as_bitmap(rgb)
-    view = {"buffer": 0, "byteOffset": len(blob), "byteLength": len(bitmap)}
-    blob += bitmap
-    scene["bufferViews"].append(view)
-    image = {"bufferView": len(scene["bufferViews"]) - 1, "mimeType": "image/bmp"}
-    scene["images"].append(image)
-    scene["textures"].append({"source": len(scene["images"]) - 1})
-    texture = {"index": len(scene["textures"]) - 1}
-    return {"pbrMetallicRoughness": {"baseColorTexture": texture}}
+    path: Path
+    find: Callable[[str], bytes]
+    scene: dict[str, Any]
+    blob: bytearray
+    given: dict[str, Any]
 
+    def add(self, data: bytes) -> int:
+        """The number of a new view of these bytes, on a place that four divides."""
+        self.blob += bytes(-len(self.blob) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data)}
+        self.scene["bufferViews"].append(view)
+        self.blob += data
+        return len(self.scene["bufferViews"]) - 1
 
-def _picture(
-    path: Path,
-    sources: dict[str, Any],
-    blob: bytearray,
-    texture: dict[str, Any] | None,
-    find: Callable[[str], bytes],
-) -> np.ndarray | None:
-    """The pixels of a texture, h x w x 4; None where there is none. Raises: BadObject."""
-    if texture is None:
-        return None
-    image = sources["images"][sources["textures"][texture["index"]]["source"]]
-    uri = image.get("uri", "")
-    if uri.startswith("data:"):
-        data = b64decode(uri.partition(",")[2])
-    elif uri:
-        try:
-            data = find(uri)
-        except FileNotFoundError:  # `find` has taken note of it
+    def append(self, rows: np.ndarray, component: int, **more: bool) -> int:
+        """The number of a new accessor with these rows."""
+        (kind,) = (name for name, width in WIDTHS.items() if width == rows.shape[1])
+        about = {"componentType": component, "count": len(rows), "type": kind, **more}
+        self.scene["accessors"].append({"bufferView": self.add(rows.tobytes()), **about})
+        return len(self.scene["accessors"]) - 1
+
+    def read(self, number: int) -> np.ndarray:
+        """The numbers of an accessor, a row each; integers as shares of their largest."""
+        accessor = self.scene["accessors"][number]
+        if "bufferView" not in accessor:
+            raise BadObject(
+                f"objects: {self.path} has an accessor without numbers; export it again."
+            )
+        view = self.scene["bufferViews"][accessor["bufferView"]]
+        if view.get("buffer") or "uri" in self.scene["buffers"][0]:
+            raise BadObject(
+                f"objects: {self.path} keeps its numbers in another file; export it as one GLB."
+            )
+        dtype, width = np.dtype(TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        stride = view.get("byteStride", dtype.itemsize * width)
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        shape, strides = (accessor["count"], width), (stride, dtype.itemsize)
+        rows: np.ndarray = np.ndarray(shape, dtype, bytes(self.blob), start, strides)
+        return rows.astype(np.float64) / (1 if dtype.kind == "f" else np.iinfo(dtype).max)
+
+    def plain_material(self, material: dict[str, Any]) -> dict[str, Any]:
+        """A material of one factor or one opaque picture in sRGB.
+
+        What it gives off is added to its base colour. Grey stands behind what is transparent, as in
+        photos, unless the material says that it is opaque.
+        """
+        surface = material.get("pbrMetallicRoughness", {})
+        factor = shares(surface.get("baseColorFactor", [1.0] * 4), self.path, "a colour's factor")
+        glow = np.array(material.get("emissiveFactor", [0.0] * 3), np.float32)
+        glow *= material.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0)
+        textures = surface.get("baseColorTexture"), material.get("emissiveTexture")
+        found = [self.picture(each) for each in textures[: 1 + glow.any()]]
+        sizes = [each.shape[1::-1] for each in found if each is not None] or [(1, 1)]
+        white = np.full((1, 1, 4), 255, np.uint8)
+        pictures = [Image.fromarray(white if each is None else each) for each in found]
+        rgba, *shining = (np.array(picture.resize(sizes[0])) for picture in pictures)
+        rgb, seen = rgba[..., :3], rgba[..., 3] / 255 * factor[3]
+        if shining or (factor[:3] != 1).any():
+            light = to_linear(np.arange(256) / 255).astype(np.float32)
+            total = light[rgb] * factor[:3].astype(np.float32)
+            total += sum(light[each[..., :3]] * glow for each in shining)
+            rgb = np.round(255 * to_srgb(total)).astype(np.uint8)
+        mode = material.get("alphaMode", "OPAQUE")
+        if mode == "MASK":
+            seen = 1.0 * (seen >= material.get("alphaCutoff", 0.5) - 1e-6)
+        if mode != "OPAQUE" and (seen < 1).any():
+            opacity = Image.fromarray(np.round(255 * seen).astype(np.uint8))
+            grey = Image.new("RGB", sizes[0], (BEHIND,) * 3)
+            rgb = np.array(Image.composite(Image.fromarray(rgb), grey, opacity))
+        if all(each is None for each in found):
+            return {"pbrMetallicRoughness": {"baseColorFactor": [*(rgb[0, 0] / 255).tolist(), 1.0]}}
+        number = len(self.scene["images"])
+        image = {"bufferView": self.add(as_bitmap(rgb)), "mimeType": "image/bmp"}
+        self.scene["images"].append(image)
+        self.scene["textures"].append({"source": number})
+        return {"pbrMetallicRoughness": {"baseColorTexture": {"index": number}}}
+
+    def picture(self, texture: dict[str, Any] | None) -> np.ndarray | None:
+        """The pixels of a texture, h x w x 4; None where there is none. Raises: BadObject."""
+        if texture is None:
             return None
-    else:
-        view = sources["bufferViews"][image["bufferView"]]
-        start = view.get("byteOffset", 0)
-        data = bytes(blob[start : start + view["byteLength"]])
-    try:
-        return decode_picture(
-            BytesIO(data), f"objects: {path}: a texture", "RGBA", upright=False, convert=False
-        )
-    except BadPhoto as error:
-        raise BadObject(str(error)) from error
+        image = self.given["images"][self.given["textures"][texture["index"]]["source"]]
+        uri = image.get("uri", "")
+        if uri.startswith("data:"):
+            data = b64decode(uri.partition(",")[2])
+        elif uri:
+            try:
+                data = self.find(uri)
+            except FileNotFoundError:  # `find` has taken note of it
+                return None
+        else:
+            view = self.given["bufferViews"][image["bufferView"]]
+            data = bytes(self.blob[view.get("byteOffset", 0) :][: view["byteLength"]])
+        name = f"objects: {self.path}: a texture"
+        try:
+            return decode_picture(BytesIO(data), name, "RGBA", upright=False, convert=False)
+        except BadPhoto as error:
+            raise BadObject(str(error)) from error
 
-
-def _place_texture(
-    path: Path,
-    scene: dict[str, Any],
-    blob: bytearray,
-    attributes: dict[str, int],
-    material: dict[str, Any],
-    sources: dict[str, Any],
-) -> None:
-    """Give a part the texture coordinates of its base colour, moved and scaled, as the first."""
-    textures = [material.get("pbrMetallicRoughness", {}).get("baseColorTexture")]
-    if any(material.get("emissiveFactor", ())):
-        textures.append(material.get("emissiveTexture"))
-    used = [texture for texture in textures if texture is not None]
-    if not used:
-        return
-    transform = used[0].get("extensions", {}).get(TRANSFORM, {})
-    number = transform.get("texCoord", used[0].get("texCoord", 0))
-    name = f"TEXCOORD_{number}"
-    fault = ""
-    if transform.get("rotation"):
-        fault = f"turns a texture by {TRANSFORM}"
-    elif {**used[0], "index": 0} != {**used[-1], "index": 0}:
-        fault = "places its emissive texture otherwise than its base colour"
-    if fault:
-        raise BadObject(
-            f"objects: {path} {fault}, which is not read here; apply it in your 3-D tool."
-        )
-    if name not in attributes:
-        raise BadObject(
-            f"objects: {path} lacks the texture coordinates {name} that a material names; unwrap "
-            "the mesh and export it again."
-        )
-    sampler = sources["textures"][used[0]["index"]].get("sampler")
-    wraps = {} if sampler is None else sources["samplers"][sampler]
-    repeats = np.array([wraps.get(axis, REPEAT) == REPEAT for axis in ("wrapS", "wrapT")])
-    if transform or number or not repeats.all():
-        uv = _read(path, scene, blob, attributes[name])
-        uv = uv * transform.get("scale", [1, 1]) + transform.get("offset", [0, 0])
-        if (outside(uv) & ~repeats).any():
-            raise BadObject(f"objects: {path} {CLAMPED}.")
-        attributes["TEXCOORD_0"] = _append(scene, blob, uv.astype("<f4"), FLOAT)
-
-
-def _read(path: Path, scene: dict[str, Any], blob: bytearray, number: int) -> np.ndarray:
-    """The numbers of an accessor, a row each; integers as shares of their largest."""
-    accessor = scene["accessors"][number]
-    if "bufferView" not in accessor:
-        raise BadObject(f"objects: {path} has an accessor without numbers; export it again.")
-    view = scene["bufferViews"][accessor["bufferView"]]
-    if view.get("buffer") or "uri" in scene["buffers"][0]:
-        raise BadObject(f"objects: {path} keeps its numbers in another file; export it as one GLB.")
-    dtype, width = np.dtype(TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]]
-    stride = view.get("byteStride", dtype.itemsize * width)
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    rows: np.ndarray = np.ndarray(
-        (accessor["count"], width), dtype, bytes(blob), start, (stride, dtype.itemsize)
-    )
-    found = rows.astype(np.float64)
-    return found if dtype.kind == "f" else found / np.iinfo(dtype).max
-
-
-def _append(
-    scene: dict[str, Any], blob: bytearray, rows: np.ndarray, component: int, **more: bool
-) -> int:
-    """Add an accessor with these rows; its number."""
-    blob += bytes(-len(blob) % 4)
-    view = {"buffer": 0, "byteOffset": len(blob), "byteLength": rows.nbytes}
-    blob += rows.tobytes()
-    scene["bufferViews"].append(view)
-    kinds = {width: name for name, width in WIDTHS.items()}
-    scene["accessors"].append(
-        {
-            "bufferView": len(scene["bufferViews"]) - 1,
-            "componentType": component,
-            "count": len(rows),
-            "type": kinds[rows.shape[1]],
-            **more,
+    def place_texture(self, attributes: dict[str, int], material: dict[str, Any]) -> None:
+        """Give a part its base colour's texture coordinates, moved and scaled, as the first."""
+        textures = [material.get("pbrMetallicRoughness", {}).get("baseColorTexture")]
+        if any(material.get("emissiveFactor", ())):
+            textures.append(material.get("emissiveTexture"))
+        used = [texture for texture in textures if texture is not None]
+        if not used:
+            return
+        transform = used[0].get("extensions", {}).get(TRANSFORM, {})
+        number = transform.get("texCoord", used[0].get("texCoord", 0))
+        name = f"TEXCOORD_{number}"
+        unread = "which is not read here; apply it in your 3-D tool"
+        faults = {
+            f"turns a texture by {TRANSFORM}, {unread}": transform.get("rotation"),
+            f"places its emissive texture otherwise than its base colour, {unread}": (
+                {**used[0], "index": 0} != {**used[-1], "index": 0}
+            ),
+            f"lacks the texture coordinates {name} that a material names; unwrap the mesh and "
+            "export it again": name not in attributes,
         }
-    )
-    return len(scene["accessors"]) - 1
+        for fault, there in faults.items():
+            if there:
+                raise BadObject(f"objects: {self.path} {fault}.")
+        sampler = self.given["textures"][used[0]["index"]].get("sampler")
+        wraps = {} if sampler is None else self.given["samplers"][sampler]
+        repeats = np.array([wraps.get(axis, REPEAT) == REPEAT for axis in ("wrapS", "wrapT")])
+        if transform or number or not repeats.all():
+            uv = self.read(attributes[name])
+            uv = uv * transform.get("scale", [1, 1]) + transform.get("offset", [0, 0])
+            if (outside(uv) & ~repeats).any():
+                raise BadObject(f"objects: {self.path} {CLAMPED}.")
+            attributes["TEXCOORD_0"] = self.append(uv.astype("<f4"), FLOAT)

@@ -218,9 +218,7 @@ def _set_upright(
     rotation = OBJECT_FROM_FILE[up]
     turned = surface.vertex @ rotation.T
     low, high = turned.min(axis=0), turned.max(axis=0)
-    scale = 1.0
-    if height_cm is not None:
-        scale = 0.01 * height_cm / max(float((high - low)[2]), 1e-30)
+    scale = 0.01 * height_cm / max(float((high - low)[2]), 1e-30) if height_cm is not None else 1.0
     size = scale * (high - low)
     _check_size(size, path, height_cm)
     base = np.array([*(low + high)[:2] / 2, low[2]])

@@ -206,7 +206,7 @@ def _colour_obj(path: Path, parts: "list[trimesh.Trimesh]") -> None:
 def _check_ply_colours(path: Path, mesh: "trimesh.Trimesh") -> None:
     """Raises: BadObject for several textures, of which trimesh takes one, and for colours in floats
     that are no shares, which it cuts off."""
-    raw: Any = mesh.metadata.get("_ply_raw", {})
+    raw = mesh.metadata.get("_ply_raw", {})
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES).partition(b"end_header")[0]
     if raw and head.count(b"TextureFile") > 1:
@@ -288,8 +288,7 @@ def _without_options(name: str, refused: list[str]) -> str:
         while len(values) < MAP_OPTIONS.get(option, 1) and len(words) > 1 and _is_number(words[0]):
             values.append(words.pop(0))
         numbers = UNMOVED.get(option, ())
-        moved = [float(value) for value in values if numbers] != list(numbers[: len(values)])
-        if moved:
+        if [float(value) for value in values if numbers] != list(numbers[: len(values)]):
             refused.append(
                 f"a texture is moved, scaled or brightened ({option} {' '.join(values)}), which is "
                 "not read here; apply it in your 3-D tool"
@@ -337,7 +336,7 @@ def _texture_picture(visual: Any) -> Rgb | None:
 
     A texture of 2 x 2 pixels only stands in for a missing file and does not count.
     """
-    material: Any = getattr(visual, "material", None)
+    material = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or getattr(visual, "uv", None) is None or max(image.size) <= 2:
         return None
@@ -560,8 +559,7 @@ def _unfold(vertex: Vertices, face: Faces) -> tuple[Int[np.ndarray, " f"], Corne
     direction = 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] > 0)
     alike = pairs[direction[pairs[:, 0]] == direction[pairs[:, 1]]]
     chart = trimesh.graph.connected_component_labels(alike, node_count=len(face))
-    plane = np.array([[1, 2], [0, 2], [0, 1]])[axis]
-    axes = plane[:, None, :].repeat(3, axis=1)
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[axis][:, None, :].repeat(3, axis=1)
     return chart.astype(np.int64), np.take_along_axis(vertex[face], axes, 2)
 
 
