@@ -296,7 +296,7 @@ def _row_words(grounding: Grounding, i: int, place: Place, cell_px: int, ink: Rg
         f"mean {grounding.similarity[i].mean():.2f}",
     ]
     if np.abs(grounding.evidence).max() >= LEAST_EVIDENCE:
-        words.append(f"points {round(float(grounding.evidence[i]), 2) or 0.0:.2f}")
+        words.append(f"prior {round(float(grounding.evidence[i]), 2) or 0.0:.2f}")
     height = cell_px / (len(words) + 1)
     return [(text, (x, y + (k + 1) * height), ink, False) for k, text in enumerate(words)]
 

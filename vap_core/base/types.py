@@ -32,7 +32,9 @@ def value[T](cls: type[T]) -> type[T]:
 class Boxes:
     """Category-level proposals of one view (P 3.3); n may be 0: a result, not an error.
 
-    `familiar` says whether the view is of the world that the stack's own models were trained on.
+    `prior` is what a detector of one's own knows of each box besides its score; it is recorded, and
+    no election counts it. `familiar` says whether the view is of the world that the stack's own
+    models were trained on.
 
     `verified` counts the points of each box that lie as they do on a reference, the most of any;
     `proof` is what that says, in units of cosine. Both are None where no points were compared."""
@@ -40,6 +42,7 @@ class Boxes:
     xyxy: Float32[np.ndarray, "n 4"]
     score: Float32[np.ndarray, " n"]
     phrase: str
+    prior: Float32[np.ndarray, " n"] | None = None
     familiar: bool = True
     verified: Int64[np.ndarray, " n"] | None = None
     proof: Float32[np.ndarray, " n"] | None = None
@@ -57,6 +60,7 @@ class Boxes:
             self,
             xyxy=self.xyxy[rows],
             score=self.score[rows],
+            prior=None if self.prior is None else self.prior[rows],
             verified=None if self.verified is None else self.verified[rows],
             proof=None if self.proof is None else self.proof[rows],
         )

@@ -244,6 +244,8 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
             "similarity": grounding.similarity.reshape(-1),
             "likeness": grounding.likeness,
         }
+        if boxes.prior is not None:
+            numbers["prior"] = boxes.prior
         if boxes.verified is not None and boxes.proof is not None:
             numbers |= {"verified": boxes.verified, "proof": boxes.proof}
     return rr.AnyValues(
