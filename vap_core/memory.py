@@ -24,7 +24,7 @@ from vap_core.base.media import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.instruction.context import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
-from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
+from vap_core.perception.candidates import describe_fault, detect, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 FORMAT = "vap-personal-object"
@@ -78,7 +78,7 @@ def reference_box(
     photo's centre.
     """
     if not isinstance(detector, ReferenceCropper):
-        (boxes,) = detector([photo], category, threshold)
+        (boxes,) = detect(detector, [photo], category, threshold)
         return boxes.xyxy[0] if len(boxes) else None
     boxes = detector.reference_boxes(photo, category, threshold)
     assert boxes.prior is not None
