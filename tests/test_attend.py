@@ -436,9 +436,7 @@ def test_a_box_by_hand_without_a_pixel_of_its_view_is_refused(
 
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
-    with pytest.raises(
-        UnknownName, match="2 objects are a 'cup': mug, other; choose with --object"
-    ):
+    with pytest.raises(UnknownName, match="2 objects are a cup: mug, other; choose with --object"):
         attender.start({"front": LINE}, "bring my cup")
     with pytest.raises(UnknownName, match="no 'shoe' is remembered"):
         attender.start({"front": LINE}, "bring my shoe")

@@ -18,7 +18,7 @@ from unicodedata import normalize
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto, UnknownName, one_of
+from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto, UnknownName, an, one_of
 from vap_core.base.files import encode_tensors, parse_json, read_file, remove_scratch, write_atomic
 from vap_core.base.media import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
@@ -184,13 +184,14 @@ def recall(
     if fitting:
         names = ", ".join(sorted(obj.name for obj in fitting))
         raise UnknownName(
-            f"recall: {len(fitting)} objects are a {target.category!r}: {names}; choose with "
+            f"recall: {len(fitting)} objects are {an(target.category)}: {names}; choose with "
             "--object."
         )
     named = memory.get(target.category)
     if named is not None:
         raise UnknownName(
-            f'recall: {named.name!r} is the name of a {named.category}; say "my {named.category}".'
+            f"recall: {named.name!r} is the name of {an(named.category)}; "
+            f'say "my {named.category}".'
         )
     contents = ", ".join(sorted(known)) or "nothing yet"
     raise UnknownName(

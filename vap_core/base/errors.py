@@ -27,6 +27,16 @@ def printable(text: str, kept: str = "\n\t") -> str:
     return "".join(shown)
 
 
+def number_of(n: int, noun: str) -> str:
+    """ "1 candidate", "2 candidates"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def an(noun: str) -> str:
+    """The noun with its article, by its first letter."""
+    return f"an {noun}" if noun[:1].lower() in tuple("aeiou") else f"a {noun}"
+
+
 def first_line(error: BaseException | str) -> str:
     """The first line of an error's text, "" where it has none."""
     return (str(error).strip().splitlines() or [""])[0]

@@ -67,7 +67,8 @@ def detect(
     fits = isinstance(found, list | tuple) and len(found) == len(images)
     for boxes, image in zip(found if fits else (), images, strict=False):
         h, w = image.shape[:2]
-        fits &= isinstance(boxes, Boxes) and (boxes.xyxy * (1, 1, -1, -1) < (w, h, 0, 0)).all()
+        within = isinstance(boxes, Boxes) and boxes.xyxy * (1, 1, -1, -1) < (w, h, 0, 0)
+        fits = fits and bool(np.all(within))
     if fits:
         return list(found)
     fault = f"{' '.join(repr(found).split()):.200}, not Boxes inside each of {len(images)} views"

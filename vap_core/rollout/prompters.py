@@ -10,7 +10,7 @@ import numpy as np
 
 from vap_core.associate import overrule
 from vap_core.attend import Attender, AttendState, Prompting
-from vap_core.base.errors import BadInstruction, BadMemory, BadStudy
+from vap_core.base.errors import BadInstruction, BadMemory, BadStudy, number_of
 from vap_core.base.types import (
     Attended,
     Boxes,
@@ -108,7 +108,7 @@ def checked_steps(
     n = len(observations)
     if not isinstance(returned, list | tuple) or len(returned) != n:
         what = len(returned) if isinstance(returned, list | tuple) else type(returned).__name__
-        episodes = "1 episode" if n == 1 else f"{n} episodes"
+        episodes = number_of(n, "episode")
         raise ValueError(f"{who} {what} results for {episodes}; return a list, one for each")
     for result, observation in zip(returned, observations, strict=True):
         is_pair = isinstance(result, list | tuple) and len(result) == 2
