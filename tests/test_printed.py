@@ -70,7 +70,8 @@ def test_text_in_a_table_of_markdown_is_no_html() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["=1+1", "+A1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")', "\n=1", "\uff1d1+1"]
+    "text",
+    ["=1+1", "+A1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")', "\n=1", "\uff1d1+1"],
 )
 def test_text_in_a_csv_file_is_no_formula(text: str) -> None:
     table = pd.DataFrame({"text": [text], "number": [-2.5]})
