@@ -526,9 +526,7 @@ def test_views_by_themselves_contradict_each_other_and_together_agree() -> None:
         )
         for text in said
     )
-    assert any(
-        text.startswith("wrist: mug is none of 1 candidate by association") for text in said
-    )
+    assert any(text.startswith("wrist: mug is none of 1 candidate by association") for text in said)
     assert any(text.startswith("mug: views associated, margin") for text in said)
     moved = {**CONTRADICTING, "side": scene([(30, 30, TEALISH), (4, 45, MOSS)])}
     _, followed = attender.step(state, moved)
