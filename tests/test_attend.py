@@ -435,9 +435,7 @@ def test_a_box_by_hand_without_a_pixel_of_its_view_is_refused(
 
 def test_what_cannot_be_matched_is_said() -> None:
     attender = Attender(TOYS, {**MEMORY, "other": personal("other", "cup", GREY)})
-    with pytest.raises(
-        UnknownName, match="2 objects are a 'cup': mug, other; choose with --object"
-    ):
+    with pytest.raises(UnknownName, match="2 objects are a cup: mug, other; choose with --object"):
         attender.start({"front": LINE}, "bring my cup")
     with pytest.raises(UnknownName, match="no 'shoe' is remembered"):
         attender.start({"front": LINE}, "bring my shoe")
@@ -527,9 +525,7 @@ def test_views_by_themselves_contradict_each_other_and_together_agree() -> None:
         )
         for text in said
     )
-    assert any(
-        text.startswith("wrist: mug is none of 1 candidates by association") for text in said
-    )
+    assert any(text.startswith("wrist: mug is none of 1 candidate by association") for text in said)
     assert any(text.startswith("mug: views associated, margin") for text in said)
     moved = {**CONTRADICTING, "side": scene([(30, 30, TEALISH), (4, 45, MOSS)])}
     _, followed = attender.step(state, moved)

@@ -207,7 +207,7 @@ def test_register_stops_at_a_doubtful_photo_and_goes_on_with_its_box(tmp_path: P
     assert "only 53x63 pixels" in done.stderr or "only 54x64 pixels" in done.stderr
     (obj,) = load_bank(tmp_path / "bank").values()
     assert len(obj.crops) == 1
-    assert "vote not checked: 1 references" in done.stdout
+    assert "vote not checked: 1 reference;" in done.stdout
 
 
 def test_register_refuses_bad_photos_and_loses_nothing(

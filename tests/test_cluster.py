@@ -105,7 +105,7 @@ def test_a_worker_writes_into_the_run_alone(tmp_path: Path, name: str) -> None:
 def test_no_cluster_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(
         BadCluster,
-        match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head",
+        match=r"no Ray cluster answers at 'nowhere' .*; start one with `ray start --head .*--include-dashboard false ",
     ):
         engine.run(
             STUDY, tmp_path / "run", progress=False, executor=workers.ray_executor("nowhere")

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from tests.command import vap
+from tests.command import refused, vap
 from tests.scanned import put
 from vap_core import cli
 from vap_core.__main__ import absent_packages
-from vap_core.base.errors import command, one_of
+from vap_core.base.errors import an, command, number_of, one_of
 
 ROOT = Path(__file__).resolve().parents[1]
 ODD = "a b'c $x"
@@ -103,3 +103,24 @@ def test_an_unknown_name_shows_the_nearest_first() -> None:
     )
     assert str(one_of("m:", "VPA", ["generic", "vap", "hard"])).endswith("vap, generic, hard.")
     assert str(one_of("m:", "cam", ["a-cam-b", "zzz"])).endswith("known: a-cam-b, zzz.")
+
+
+@pytest.mark.parametrize(
+    ("word", "left"),
+    [("~/x.png", "~"), ("--out=~/runs", "~"), ("$HOME/x.png", "$HOME"), ("${PHOTOS}", "${PHOTOS}")],
+)
+def test_a_word_that_the_shell_did_not_expand_is_refused(word: str, left: str) -> None:
+    """--out=~/runs made a folder of that name in silence."""
+    said = f"{word}: the shell left {left} as it is; write the path without quotes"
+    assert said in refused("ground", word, "bring my cup")
+    assert "x.png is not a file" in refused("ground", "x.png", "bring my $5 cup, ~ the red one")
+
+
+def test_numbers_and_articles_agree_with_their_noun() -> None:
+    """ "1 candidates", "a espresso cup"."""
+    assert [number_of(n, "photo") for n in (0, 1, 2)] == ["0 photos", "1 photo", "2 photos"]
+    assert [an(word) for word in ("espresso cup", "Owl", "cup")] == [
+        "an espresso cup",
+        "an Owl",
+        "a cup",
+    ]

@@ -406,7 +406,7 @@ def test_what_fits_nothing_is_refused_in_one_line(
 
 
 def test_other_refusals(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadStudy, match="no failure #3; there are 3, counted from 0"):
+    with pytest.raises(BadStudy, match="no failure #3; they are #0 to #2"):
         recording_of(list_failures(run), 3)
     with pytest.raises(BadOutput, match=r"run\.json is absent or damaged"):
         list_failures(tmp_path)

@@ -265,7 +265,7 @@ def test_a_run_of_errors_alone_is_no_success(tmp_path: Path) -> None:
     done = vap(*words)
     assert done.returncode == 2
     *_, line = done.stderr.strip().splitlines()
-    assert "note: 2 episodes are errors; when the cause is mended, the same" in done.stderr
+    assert "note: 2 episodes ended in an error; when the cause is mended, the same" in done.stderr
     assert "--retries 1 tries again" in done.stderr
     assert "every one of the 2 episodes" in line
     assert "of 2 of them: " in line

@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+import secrets
 import shlex
 import shutil
 import subprocess
@@ -81,9 +82,9 @@ def test_make_lab_serves_every_picture_and_link_of_a_notebook(tmp_path: Path) ->
     address = f"http://127.0.0.1:{(port := free_port())}"
     command = [sys.executable, "-m", "jupyter", "lab", "--ip", "127.0.0.1", f"--port={port}"]
     command += [*shlex.split(" ".join(options)), "--no-browser", "--allow-root"]
-    command += ["--IdentityProvider.token=secret"]
-    asking = {"headers": {"Authorization": "token secret"}, "timeout": 30}
-    environment = {**os.environ, "HOME": str(tmp_path)}
+    token = secrets.token_hex()
+    asking = {"headers": {"Authorization": f"token {token}"}, "timeout": 30}
+    environment = {**os.environ, "HOME": str(tmp_path), "JUPYTER_TOKEN": token}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(command, cwd=ROOT, env=environment, **quiet) as process:
         try:
@@ -93,6 +94,12 @@ def test_make_lab_serves_every_picture_and_link_of_a_notebook(tmp_path: Path) ->
                     if httpx.get(f"{address}/api/status", **asking).status_code == 200:
                         break
                 time.sleep(0.5)
+            for of_a_stranger in ({}, {"Authorization": "token 0"}):
+                for path in ("api/contents", "api/kernels", "api/terminals"):
+                    refused = httpx.get(f"{address}/{path}", headers=of_a_stranger, timeout=30)
+                    assert refused.status_code == 403
+            rebound = {**asking["headers"], "Host": "a.page.of.a.stranger"}
+            assert httpx.get(f"{address}/api/contents", headers=rebound).status_code == 403
             first = httpx.get(f"{address}/", follow_redirects=True, **asking)
             assert first.url.path == "/lab/tree/notebooks/00_tour.ipynb"
             asked = 0

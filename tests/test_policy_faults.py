@@ -97,7 +97,7 @@ def crash(states: list, chunks: list, i: int) -> object:
     ("change", "message"),
     [
         (crash, "ValueError: the policy's own mistake"),
-        (leave, r"the policy called sys\.exit\(0\)"),
+        (leave, r"the policy raised SystemExit\(0\); raise an Exception"),
         (ends_all, r"the policy raised Odd\('of a library'\); raise an Exception"),
         (closes, r"the policy raised GeneratorExit\(\); raise an Exception"),
         (with_chunk(np.full((1, 7), np.nan, np.float32)), "numbers that are not finite"),
@@ -126,6 +126,10 @@ def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, messa
         ),
         (with_chunk(np.zeros((1, 7))), "and type float64 as a chunk; .* of type float32"),
         (with_chunk(np.full((1, 7), "x")), "and type <U1 as a chunk"),
+        (
+            with_chunk(np.ma.masked_array(np.zeros((1, 7), np.float32), mask=True)),
+            "plan returned MaskedArray: an array of shape",
+        ),
     ],
 )
 def test_what_breaks_the_protocol_is_the_error_of_its_episode(

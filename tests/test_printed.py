@@ -61,16 +61,22 @@ def test_the_bars_of_long_work_still_move() -> None:
 
 
 def test_text_in_a_table_of_markdown_is_no_html() -> None:
-    table = printed([["a|b"], ["<img src=x onerror=alert(1)> & <b> &lt; p < 0.1"]], "markdown")
+    rows = [["a|b"], ["<img src=x onerror=alert(1)> & <b> &lt; p < 0.1"], ["![i](http://x/y)"]]
+    table = printed([*rows, ["one\\|cell"]], "markdown")
+    assert "![i]\\(http://x/y)" in table  # a picture that is fetched where the report is read
+    assert "one\\\\\\|cell" in table
     assert "<img" not in table
     assert "&lt;img src=x onerror=alert(1)> & &lt;b> &amp;lt; p < 0.1" in table
 
 
 @pytest.mark.parametrize(
-    "text", ["=1+1", "+A1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")']
+    "text",
+    ["=1+1", "+A1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", '=HYPERLINK("x")', "\n=1", "\uff1d1+1"],
 )
 def test_text_in_a_csv_file_is_no_formula(text: str) -> None:
-    written = printed(pd.DataFrame({"text": [text], "number": [-2.5]}), "csv")
+    table = pd.DataFrame({"text": [text], "number": [-2.5]})
+    written = printed(table, "csv")
+    assert written == printed(table.astype({"text": "category"}), "csv")
     assert written.splitlines()[0] == "text,number"
     assert written.split("\n", 1)[1].lstrip('"').startswith("'")
     assert written.rstrip().endswith("-2.5")

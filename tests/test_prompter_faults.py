@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from tests.toys import TOYS, MeanColour, personal
 from vap_core.attend import Attender
 from vap_core.base.errors import BadCrop, BadEncoder
-from vap_core.base.types import Attended, Boxes, Rgb
+from vap_core.base.types import Attended, Boxes, Rgb, Track
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import PromptContext, TintPrompter, checked_steps, unchanged
 from vap_core.simulation.types import Observation
@@ -49,6 +50,17 @@ class Faulty:
         return self.change(results, states.index(2)) if 2 in states else results
 
 
+def shown_as(change: Callable[[Rgb], Rgb]) -> Change:
+    """Its pictures are changed, under the same name."""
+
+    def changed(results: list[Result], i: int) -> list[Result]:
+        state, attended = results[i]
+        images = {name: change(image) for name, image in attended.images.items()}
+        return [*results[:i], (state, replace(attended, images=images)), *results[i + 1 :]]
+
+    return changed
+
+
 class Fails(MeanColour):
     """Gives numbers that are not finite from one call to another."""
 
@@ -65,6 +77,22 @@ class Fails(MeanColour):
 def middle(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
     xyxy = np.array([[60, 60, 120, 120]], np.float32)
     return [Boxes(xyxy, np.ones(1, np.float32), phrase) for _ in images]
+
+
+class Second:
+    """A part whose second answer is another's."""
+
+    def __init__(self, good: Callable[..., object], wrong: Callable[..., object]) -> None:
+        self.parts = iter((good, wrong, good))
+
+    def __call__(self, *given: object) -> object:
+        return next(self.parts)(*given)
+
+
+def squares(image: Rgb, boxes: Boxes) -> np.ndarray:
+    masks = np.zeros((len(boxes), *image.shape[:2]), bool)
+    masks[:, 60:120, 60:120] = True
+    return masks
 
 
 def with_encoder(trial: Trial, encoder: Fails) -> Trial:
@@ -91,6 +119,11 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
             lambda all_, i: [*all_[:i], (2, None), *all_[i + 1 :]],
             "tuple as a result; return the state and an Attended",
         ),
+        (
+            shown_as(lambda image: image[::2]),
+            r"pictures {'front': \('ndarray', 112, 224, 3\)}; ret",
+        ),
+        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 224, 224, 3\)}; ret"),
     ],
 )
 def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
@@ -115,20 +148,13 @@ def paint(results: list[Result], i: int) -> list[Result]:
     return results
 
 
-def painted(results: list[Result], i: int) -> list[Result]:
-    """On copies."""
-    state, attended = results[i]
-    images = {name: np.zeros_like(image) for name, image in attended.images.items()}
-    return [*results[:i], (state, replace(attended, images=images)), *results[i + 1 :]]
-
-
 def test_a_prompter_cannot_write_into_what_it_is_given(trial: Trial) -> None:
     """The recording shows what the cameras saw. It may paint copies."""
     one, bad, other = rollout(replace(trial, prompter=Faulty(paint)), ROWS, batch=3)
     statuses = [each.outcome.status for each in (one, bad, other)]
     assert statuses == ["failure", "error", "failure"]
     assert "read-only" in bad.outcome.detail.strip().splitlines()[-1]
-    good = replace(trial, prompter=Faulty(painted))
+    good = replace(trial, prompter=Faulty(shown_as(np.zeros_like)))
     _, episode, _ = rollout(good, ROWS, batch=3, keep_images=True)
     assert episode.outcome.status == "failure"
     last = episode.frames[-1]
@@ -138,8 +164,9 @@ def test_a_prompter_cannot_write_into_what_it_is_given(trial: Trial) -> None:
 
 def test_the_number_of_episodes_is_in_the_message() -> None:
     line = "prompter Faulty: steps returned 0 results for 2 episodes; return a list, one for each"
+    seen = Observation({}, np.zeros(7, np.float32))
     with pytest.raises(ValueError, match=line):
-        checked_steps([], Faulty(lambda results, i: results), 2)
+        checked_steps([], Faulty(lambda results, i: results), [seen, seen])
 
 
 def test_a_crop_that_cannot_be_embedded_is_the_error_of_its_episode(trial: Trial) -> None:
@@ -149,6 +176,86 @@ def test_a_crop_that_cannot_be_embedded_is_the_error_of_its_episode(trial: Trial
         statuses = [each.outcome.status for each in (one, bad, other)]
         assert statuses == ["failure", "error", "failure"]
         assert "gave numbers that are not finite; test it with pytest" in bad.outcome.detail
+
+
+def ends(*_: object) -> object:
+    raise GeneratorExit
+
+
+def far(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> list[Boxes]:
+    return [Boxes(boxes.xyxy + 900, boxes.score, phrase) for boxes in middle(images, phrase)]
+
+
+def boxed(xyxy: Sequence[float], score: float) -> Callable[..., object]:
+    """A detector of one box of every picture."""
+
+    def detector(images: Sequence[Rgb], phrase: str, threshold: float | None = None) -> object:
+        corners, scores = np.array([xyxy], np.float32), np.array([score], np.float32)
+        return [Boxes(corners, scores, phrase) for _ in images]
+
+    return detector
+
+
+@pytest.mark.parametrize(
+    ("role", "wrong", "cause"),
+    [
+        (
+            "detector",
+            lambda *_: None,
+            "BadPart: detect: detector 'Second' gave None, not Boxes insid",
+        ),
+        ("detector", lambda *_: [], "'Second' gave \\[\\], not Boxes inside each of 1 views; test"),
+        ("detector", lambda *_: "boxes", "'Second' gave 'boxes', not Boxes .* --detector MOD"),
+        ("detector", far, r"'Second' gave \[Boxes\(xyxy=array\(\[\[ 960., "),
+        ("detector", boxed((9, 9, np.inf, 20), 1), "far corner must exceed near corner"),
+        ("detector", boxed((9, 9, 20, 20), np.nan), r"scores are in \[0, 1\], got \[nan\]"),
+        ("detector", boxed((9, 9, 20, 20), 5), r"scores are in \[0, 1\], got \[5.0\]"),
+        ("detector", ends, "GeneratorExit"),
+        (
+            "segmenter",
+            lambda *_: None,
+            "'Second' gave NoneType  , not ndarray bool .1, 224, 224.; t",
+        ),
+        (
+            "segmenter",
+            lambda image, boxes: squares(image, boxes)[:0],
+            r"gave ndarray bool \(0, 224, 224\), not ndarray bool \(1, 224, 224\); test",
+        ),
+        (
+            "segmenter",
+            lambda image, boxes: squares(image, boxes).astype(np.uint8),
+            r"gave ndarray uint8 \(1, 224, 224\), not ndarray bool",
+        ),
+        (
+            "segmenter",
+            lambda image, boxes: np.ma.masked_array(squares(image, boxes), mask=True),
+            "segmenter 'Second' gave MaskedArray bool .* --segmenter MODULE:NAME",
+        ),
+        ("segmenter", ends, "GeneratorExit"),
+    ],
+)
+def test_what_a_part_gives_against_its_protocol_is_the_error_of_its_episode(
+    trial: Trial, role: str, wrong: Callable[..., object], cause: str
+) -> None:
+    """The last line of its detail names the part."""
+    parts: dict[str, Any] = {"detector": middle, "segmenter": squares}
+    parts[role] = Second(parts[role], wrong)
+    stack = TOYS.with_parts("mine", **parts)
+    mug = personal("mug", "shaver", (200, 30, 30))
+    tinted = replace(trial, prompter=TintPrompter(Attender(stack, {"mug": mug})))
+    rows = [replace(row, max_steps=0) for row in ROWS]
+    one, bad, other = rollout(tinted, rows, batch=3)
+    statuses = [each.outcome.status for each in (one, bad, other)]
+    assert statuses == ["failure", "error", "failure"]
+    assert re.search(cause, bad.outcome.detail.strip().splitlines()[-1])
+
+
+@pytest.mark.parametrize("score", [np.nan, 7.0, -0.1])
+def test_a_track_has_a_score_from_0_to_1_and_its_mask_counts(score: float) -> None:
+    with pytest.raises(ValueError, match="outside"):
+        Track(None, float(score))
+    with pytest.raises(ValueError, match="masked array"):
+        Track(np.ma.masked_array(np.ones((2, 2), bool), mask=True), 1.0)
 
 
 def test_an_encoder_that_fails_for_everything_ends_the_run_in_one_line(trial: Trial) -> None:

@@ -126,7 +126,7 @@ def test_what_is_to_be_run_next_runs(bank: Path, tmp_path: Path, owner: str) -> 
         words[1] = str(tmp_path / "a.png")
         done = vap(*words, "--out", tmp_path / "out")
         assert done.returncode == 0, done.stderr
-        assert f"{name} against 1 candidates" in done.stdout
+        assert f"{name} against 1 candidate;" in done.stdout
 
 
 def test_a_refused_replacement_leaves_the_sheet_of_the_object_that_stays(

@@ -199,6 +199,9 @@ def test_missing_gl_names_the_cause_and_the_line_to_run(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     with pytest.raises(MissingGL, match="MUJOCO_GL=osmesa cannot draw.*unset MUJOCO_GL"):
         ensure_gl()
+    monkeypatch.setattr(gl.resource, "getrlimit", lambda kind: (400_000 * 1024, -1))
+    with pytest.raises(MissingGL, match=r"raise the limit of memory \(ulimit -v\), or unset"):
+        ensure_gl()
 
 
 def test_a_back_end_that_works_is_kept_and_probed_once(monkeypatch):

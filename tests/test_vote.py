@@ -207,6 +207,7 @@ def attending(encoder: Encoder) -> None:
         ),
         (lambda rows: rows.tolist(), "list, not a NumPy array"),
         (lambda rows: memoryview(rows), "memoryview, not a NumPy array"),
+        (np.ma.masked_array, "MaskedArray, not a NumPy array"),
         (lambda rows: None, "NoneType, not a NumPy array"),
         (lambda rows: rows.ravel(), r"an array of shape \(\d,\) and type float32, not"),
         (lambda rows: rows[:-1], r"\d rows for \d crops"),

@@ -18,13 +18,13 @@ from unicodedata import normalize
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto, UnknownName, one_of
+from vap_core.base.errors import BadEncoder, BadMemory, BadOutput, BadPhoto, UnknownName, an, one_of
 from vap_core.base.files import encode_tensors, parse_json, read_file, remove_scratch, write_atomic
 from vap_core.base.media import load_photo as load_photo
 from vap_core.base.types import Description, PersonalObject, Rgb, Target
 from vap_core.instruction.context import belonging, check_owner, owners_of
 from vap_core.perception.boxes import crop
-from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
+from vap_core.perception.candidates import describe_fault, detect, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 FORMAT = "vap-personal-object"
@@ -78,7 +78,7 @@ def reference_box(
     photo's centre.
     """
     if not isinstance(detector, ReferenceCropper):
-        (boxes,) = detector([photo], category, threshold)
+        (boxes,) = detect(detector, [photo], category, threshold)
         return boxes.xyxy[0] if len(boxes) else None
     boxes, evidence = detector.reference_boxes(photo, category, threshold)
     h, w = photo.shape[:2]
@@ -183,13 +183,14 @@ def recall(
     if fitting:
         names = ", ".join(sorted(obj.name for obj in fitting))
         raise UnknownName(
-            f"recall: {len(fitting)} objects are a {target.category!r}: {names}; choose with "
+            f"recall: {len(fitting)} objects are {an(target.category)}: {names}; choose with "
             "--object."
         )
     named = memory.get(target.category)
     if named is not None:
         raise UnknownName(
-            f'recall: {named.name!r} is the name of a {named.category}; say "my {named.category}".'
+            f"recall: {named.name!r} is the name of {an(named.category)}; "
+            f'say "my {named.category}".'
         )
     contents = ", ".join(sorted(known)) or "nothing yet"
     raise UnknownName(

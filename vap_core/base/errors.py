@@ -27,6 +27,16 @@ def printable(text: str, kept: str = "\n\t") -> str:
     return "".join(shown)
 
 
+def number_of(n: int, noun: str) -> str:
+    """ "1 candidate", "2 candidates"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def an(noun: str) -> str:
+    """The noun with its article, by its first letter."""
+    return f"an {noun}" if noun[:1].lower() in tuple("aeiou") else f"a {noun}"
+
+
 def first_line(error: BaseException | str) -> str:
     """The first line of an error's text, "" where it has none."""
     return (str(error).strip().splitlines() or [""])[0]
@@ -128,6 +138,10 @@ class BadViews(VapError):
 
 class BadEncoder(VapError):
     """An encoder whose rows have another form than asked for, are not finite or not of length 1."""
+
+
+class BadPart(VapError):
+    """What a detector or segmenter gave for some pictures is not its protocol's."""
 
 
 class BadCrop(BadEncoder):
@@ -248,7 +262,7 @@ AGAIN_S = 1.0
 """Libraries that catch every exception are interrupted again after so much CPU time."""
 
 
-class _TimeIsUp(BaseException):
+class TimeIsUp(BaseException):
     """Raised inside the work. No `except Exception` of a library's catches it."""
 
 
@@ -264,7 +278,7 @@ def bounded(memory_bytes: int, cpu_s: float) -> Iterator[None]:
     try:
         with _memory_limit(memory_bytes), _timer(cpu_s):
             yield
-    except _TimeIsUp:
+    except TimeIsUp:
         raise TimeoutError(f"over {cpu_s:g} s of CPU time") from None
 
 
@@ -291,16 +305,28 @@ def _timer(cpu_s: float) -> Iterator[None]:
         yield
         return
 
-    def interrupt(*_: object) -> None:
-        raise _TimeIsUp
+    with interrupting(cpu_s, signal.SIGPROF, signal.ITIMER_PROF, AGAIN_S):
+        yield
 
-    former = signal.signal(signal.SIGPROF, interrupt)
-    signal.setitimer(signal.ITIMER_PROF, cpu_s, AGAIN_S)
+
+@contextmanager
+def interrupting(
+    seconds: float, number: signal.Signals, timer: int, again_s: float = 0.0
+) -> Iterator[None]:
+    """Raises TimeIsUp in the block after that time; only in the main thread."""
+
+    def interrupt(*_: object) -> None:
+        raise TimeIsUp
+
+    handler = signal.signal(number, interrupt)
+    delay_s, _ = signal.setitimer(timer, seconds, again_s)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, former)
+        try:
+            signal.setitimer(timer, delay_s)
+        finally:
+            signal.signal(number, handler)
 
 
 def command(*words: str | Path, environment: Mapping[str, str] | None = None) -> str:

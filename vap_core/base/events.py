@@ -3,6 +3,7 @@ were lost and found."""
 
 from collections.abc import Mapping
 
+from vap_core.base.errors import number_of
 from vap_core.base.files import signed
 from vap_core.base.types import Association, Ballot, Event, Grounding
 
@@ -119,7 +120,7 @@ def _elected(grounding: Grounding, chosen_by: str, without: str) -> Event:
         text = f"{camera}: {name} {describe_rejection(grounding)}, {without}"
         return Event(0, "WARN", text)
     if grounding.winner is None:
-        text = f"{camera}: {name} is none of {n} candidates by {chosen_by}, {without}"
+        text = f"{camera}: {name} is none of {number_of(n, 'candidate')} by {chosen_by}, {without}"
         return Event(0, "WARN", text)
     # Whether the candidate is the named object is not known here, so the text does not say it.
     verb = "takes" if grounding.overruled else "elects"

@@ -48,8 +48,11 @@ class Boxes:
     proof: Float32[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
-        if len(self.xyxy) and not (self.xyxy[:, 2:] > self.xyxy[:, :2]).all():
+        sides = self.xyxy[:, 2:] - self.xyxy[:, :2]
+        if not ((sides > 0) & (sides < np.inf)).all():
             raise ValueError(f"Boxes: far corner must exceed near corner, got {self.xyxy.tolist()}")
+        if not ((self.score >= 0) & (self.score <= 1)).all():
+            raise ValueError(f"Boxes: scores are in [0, 1], got {self.score.tolist()}")
 
     def __len__(self) -> int:
         return len(self.xyxy)
@@ -303,6 +306,10 @@ class Track:
 
     mask: Mask | None
     score: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score <= 1 or isinstance(self.mask, np.ma.MaskedArray):
+            raise ValueError(f"Track: score {self.score} outside [0, 1], or a masked array")
 
 
 @value

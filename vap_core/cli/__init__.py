@@ -6,6 +6,7 @@ correct is one line, with status 2.
 
 import inspect
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -23,6 +24,8 @@ worked or failed.
 
 Start with: python -m vap_core doctor, then python -m vap_core demo."""
 INTERRUPTED = 130
+AS_WRITTEN = re.compile(r"^(?:--[\w-]+=)?(~\w*|\$\w+|\$\{\w+\})(?:/|$)")
+"""How a word begins that the shell expands unless it is quoted."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -114,6 +117,12 @@ def _run() -> None:
     """Run the command that the words name."""
     try:
         try:
+            for word in sys.argv[1:]:
+                if found := AS_WRITTEN.search(word):
+                    raise VapError(
+                        f"{word}: the shell left {found[1]} as it is; write the path without "
+                        "quotes, and a blank for the =."
+                    )
             app()
         finally:
             sys.stdout.flush()

@@ -95,7 +95,7 @@ def register(
     import os.path
     from contextlib import suppress
 
-    from vap_core.base.errors import command
+    from vap_core.base.errors import an, command, number_of
     from vap_core.instruction.context import check_owner
     from vap_core.memory import check_names, object_path, save, taken
     from vap_core.perception.describe import load_captioner, with_description
@@ -131,7 +131,8 @@ def register(
     obj = with_description(obj, load_captioner(models.segmenter, describe))
     obj = dataclasses.replace(obj, owner=owner, known_as=tuple(known_as or []), note=note)
     path = save(memory, obj, replace=replace)
-    print(f"{obj.name}: a {obj.category} with {len(obj.crops)} references, saved to {path}")
+    photos_of = number_of(len(obj.crops), "reference")
+    print(f"{obj.name}: {an(obj.category)} with {photos_of}, saved to {path}")
     sheet = memory / f"{name}.references.png"
     registering.write_sheet(sheet, references, paths)
     with suppress(OSError):
@@ -340,7 +341,7 @@ def import_object(
 
     Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
     """
-    from vap_core.base.errors import command
+    from vap_core.base.errors import an, command
     from vap_core.simulation.assets.objects import extent_m, load_scanned_object
     from vap_core.simulation.assets.scans import import_scan, storage
     from vap_core.simulation.grasps import too_wide_for
@@ -366,7 +367,7 @@ def import_object(
     x_m, y_m, z_m = extent_m(model)
     size = f"{100 * x_m:.1f} x {100 * y_m:.1f} x {100 * z_m:.1f}"
     print(
-        f"{metadata.name}: a {metadata.category}, {size} cm, {metadata.mass_kg:g} kg, "
+        f"{metadata.name}: {an(metadata.category)}, {size} cm, {metadata.mass_kg:g} kg, "
         f"{len(scan.hulls)} convex parts, saved to {saved}"
     )
     preview = folder / f"{metadata.name}.preview.png"
@@ -385,7 +386,7 @@ def import_object(
         environment[storage.VARIABLE] = str(folder)
     words = ("eval", "--suite", "SUITE", "--object", metadata.name)
     line = command(*words, "--out", f"data/runs/{metadata.name}", environment=environment)
-    print(f"next: {line}  # of a suite that asks for a {category}")
+    print(f"next: {line}  # of a suite that asks for {an(category)}")
 
 
 @objects.command("list")

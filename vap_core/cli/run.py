@@ -356,7 +356,7 @@ def study_of(asked: AskedOfAll) -> "Study":
     Raises: BadStudy for names of methods that name none, or when no task has the category;
         BadSuite; else as `Study`.
     """
-    from vap_core.base.errors import BadStudy
+    from vap_core.base.errors import BadStudy, an
     from vap_core.policies.names import PRIVILEGED
     from vap_core.simulation.assets.objects import get_object
     from vap_core.simulation.suites import BENCHMARKS, open_file, tasks_of
@@ -379,7 +379,7 @@ def study_of(asked: AskedOfAll) -> "Study":
         tasks = tasks_of(suite_names, asked.object)
     if not tasks:
         raise BadStudy(
-            f"--object: {asked.object} is a {get_object(asked.object).category}, and no task of "
+            f"--object: {asked.object} is {an(get_object(asked.object).category)}, and no task of "
             f"{', '.join(suite_names)} asks for one; python -m vap_core suites lists the tasks."
         )
     policy = asked.policy or default_policy(suite_names)

@@ -6,7 +6,7 @@ import numpy as np
 
 from vap_core.base.types import Attended, Views
 from vap_core.contracts.given import short_rows
-from vap_core.rollout.prompters import PromptContext, Prompter, SceneTruth
+from vap_core.rollout.prompters import PromptContext, Prompter, SceneTruth, checked_steps
 from vap_core.simulation.env import Env
 from vap_core.simulation.suites.open_row import open_row
 from vap_core.simulation.types import Observation
@@ -36,12 +36,8 @@ def two_steps(prompter: Prompter[Any], where: str) -> list[tuple[Step, Step]]:
 
 
 def check_fits(attended: Attended, observation: Observation) -> None:
-    assert isinstance(attended.text, str)
     assert attended.text
-    assert attended.images.keys() == observation.images.keys()
-    for name, image in attended.images.items():
-        assert image.dtype == np.uint8
-        assert image.shape == observation.images[name].shape
+    checked_steps([(None, attended)], "", [observation])
 
 
 def check_same(one: Attended, other: Attended) -> None:

@@ -33,7 +33,6 @@ def test_every_identity_has_a_track_in_order(tracker: Tracker, scene: RenderedSc
     assert (len(first), len(second)) == (len(scene.masks), 1)
     for track in (*first, *second):
         assert isinstance(track, Track)
-        assert 0 <= track.score <= 1
         if track.mask is not None:
             assert track.mask.shape == scene.rgb.shape[:2]
 

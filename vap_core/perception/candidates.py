@@ -7,10 +7,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from vap_core.base.errors import BadEncoder
+from vap_core.base.errors import BadEncoder, BadPart
 from vap_core.base.types import Boxes, PersonalObject, Rgb, Views, value
 from vap_core.perception.boxes import box_iou, crop
-from vap_core.perception.protocols import Encoder, Stack, Verifier
+from vap_core.perception.protocols import Detector, Encoder, Segmenter, Stack, Verifier
 
 LENGTH_TOLERANCE = 1e-3
 """How far from 1 an embedding's length may be."""
@@ -24,7 +24,7 @@ def embed_crops(what: str, encoder: Encoder, crops: Sequence[Rgb]) -> Float32[np
     """
     rows = encoder(crops)
     fault = ""
-    if not isinstance(rows, np.ndarray):
+    if type(rows) is not np.ndarray:
         fault = f"{type(rows).__name__}, not a NumPy array"
     elif rows.ndim != 2 or rows.dtype != np.float32:
         fault = f"an array of shape {rows.shape} and type {rows.dtype}, not float32 (crops, width)"
@@ -46,16 +46,43 @@ def row_fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray,
     return f"a row of length {length[far][0]:.3g}, not of length 1" if far.any() else ""
 
 
-def describe_fault(what: str, encoder: Encoder, fault: str) -> str:
-    """The line about an encoder that gave `fault` when `what` asked it."""
+def describe_fault(what: str, part: object, fault: str, role: str = "encoder") -> str:
+    """The line about a part of a stack that gave `fault` when `what` asked it."""
+    name = getattr(part, "name", type(part).__name__)
     return (
-        f"{what}: encoder {encoder.name!r} gave {fault}; test it with "
-        "pytest --pyargs vap_core.contracts --encoder MODULE:NAME."
+        f"{what}: {role} {name!r} gave {fault}; test it with "
+        f"pytest --pyargs vap_core.contracts --{role} MODULE:NAME."
     )
 
 
 SAME_BOX_IOU = 0.7
 """Boxes of two phrases that overlap by more than this IoU are the same object."""
+
+
+def detect(
+    detector: Detector, images: Sequence[Rgb], phrase: str, threshold: float | None = None
+) -> list[Boxes]:
+    """What a detector finds, as the protocol has it. Raises: BadPart."""
+    found = detector(images, phrase, threshold)
+    fits = isinstance(found, list | tuple) and len(found) == len(images)
+    for boxes, image in zip(found if fits else (), images, strict=False):
+        h, w = image.shape[:2]
+        within = isinstance(boxes, Boxes) and boxes.xyxy * (1, 1, -1, -1) < (w, h, 0, 0)
+        fits = fits and bool(np.all(within))
+    if fits:
+        return list(found)
+    fault = f"{' '.join(repr(found).split()):.200}, not Boxes inside each of {len(images)} views"
+    raise BadPart(describe_fault("detect", detector, fault, "detector"))
+
+
+def draw_masks(segmenter: Segmenter, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
+    """The segmenter's masks, as the protocol has them. Raises: BadPart."""
+    masks = segmenter(image, boxes)
+    kind = f"{type(masks).__name__} {getattr(masks, 'dtype', '')} {getattr(masks, 'shape', '')}"
+    wanted = f"ndarray bool {(len(boxes), *image.shape[:2])}"
+    if kind == wanted:
+        return masks
+    raise BadPart(describe_fault("segment", segmenter, f"{kind}, not {wanted}", "segmenter"))
 
 
 @value
@@ -82,7 +109,7 @@ class Candidates:
 
 def propose(views: Views, phrase: str, stack: Stack) -> dict[str, Proposals]:
     """What the detector proposes for a phrase in every view, embedded."""
-    detected = stack.detector(list(views.values()), phrase)
+    detected = detect(stack.detector, list(views.values()), phrase)
     return embed_views(views, dict(zip(views, detected, strict=True)), stack)
 
 
@@ -113,7 +140,7 @@ def segment(
     A box that is a candidate for an earlier target too keeps its identity.
     """
     boxes = proposals.boxes
-    masks = stack.segmenter(rgb, boxes)
+    masks = draw_masks(stack.segmenter, rgb, boxes)
     return Candidates(boxes, proposals.embeddings, masks, _assign_ids(boxes, known))
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 from vap_core.base.errors import BadEncoder
 from vap_core.base.types import Boxes, Rgb, value
 from vap_core.perception.boxes import box_cover, box_iou, crop
-from vap_core.perception.candidates import describe_fault, embed_crops, row_fault
+from vap_core.perception.candidates import describe_fault, detect, embed_crops, row_fault
 from vap_core.perception.protocols import Detector, Encoder, ReferenceCropper
 
 THRESHOLD = 0.05
@@ -144,7 +144,7 @@ def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) 
     if isinstance(detector, ReferenceCropper):
         found, _ = detector.reference_boxes(photo, category, THRESHOLD)
     else:
-        (found,) = detector([photo], category, THRESHOLD)
+        (found,) = detect(detector, [photo], category, THRESHOLD)
     xyxy = found.xyxy[:MOST_BOXES]
     score = found.score[:MOST_BOXES]
     if given is not None:

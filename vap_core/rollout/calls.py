@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vap_core.base.errors import BadPlan, BadPolicy, BadStudy, one_of
+from vap_core.base.errors import BadPlan, BadPolicy, BadStudy, TimeIsUp, interrupting, one_of
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.protocol import (
     ACTION,
@@ -30,10 +30,6 @@ NOTE_AFTER_S = 60.0
 """A call that takes longer is noted on stderr, with the episodes that wait for it."""
 
 
-class _TimeIsUp(BaseException):
-    """Raised inside the policy. No `except Exception` of the policy's catches it."""
-
-
 @contextmanager
 def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None]:
     """Ends the block with an error after `limit_s` seconds (None: never).
@@ -43,8 +39,8 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
     returns late or never, such as one long kernel of torch: that one ends first. A policy whose own
     code catches BaseException can go on.
 
-    Raises: TimeoutError; RuntimeError when the policy calls sys.exit; BadStudy for a limit that is
-        not above 0, or outside the main thread, where no handler runs.
+    Raises: TimeoutError; RuntimeError for what is no Exception, as sys.exit; BadStudy for a limit
+        that is not above 0, or outside the main thread, where no handler runs.
     """
     check_limit(limit_s)
     note = threading.Timer(
@@ -61,11 +57,7 @@ def policy_call(limit_s: float | None, episodes: Sequence[str]) -> Iterator[None
     try:
         with _timer(limit_s):
             yield
-    except SystemExit as error:
-        raise RuntimeError(
-            f"the policy called sys.exit({error.code!r}); raise an error instead."
-        ) from error
-    except _TimeIsUp:
+    except TimeIsUp:
         raise TimeoutError(
             f"the policy did not answer within {limit_s:g} s; allow more with --policy-timeout."
         ) from None
@@ -132,9 +124,14 @@ def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[st
     for chunk in chunks:
         found = type(chunk).__name__
         if isinstance(chunk, np.ndarray):
-            if chunk.shape[1:] == (size,) and len(chunk) and chunk.dtype == np.float32:
+            if (
+                type(chunk) is np.ndarray
+                and chunk.shape[1:] == (size,)
+                and len(chunk)
+                and chunk.dtype == np.float32
+            ):
                 continue
-            found = f"an array of shape {chunk.shape} and type {chunk.dtype}"
+            found += f": an array of shape {chunk.shape} and type {chunk.dtype}"
         raise BadPlan(
             f"{label}: plan returned {found} as a chunk; return a NumPy array of type float32 and "
             f"shape (steps, {size}), in every row {', '.join(action_names)}."
@@ -143,7 +140,7 @@ def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[st
 
 @contextmanager
 def _timer(limit_s: float | None) -> Iterator[None]:
-    """Raises _TimeIsUp in the block after that time."""
+    """Raises TimeIsUp in the block after that time."""
     if limit_s is None:
         yield
         return
@@ -153,18 +150,8 @@ def _timer(limit_s: float | None) -> Iterator[None]:
             "leave the limit out."
         )
 
-    def interrupt(*_: object) -> None:
-        raise _TimeIsUp
-
-    handler = signal.signal(signal.SIGALRM, interrupt)
-    delay_s, _ = signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
+    with interrupting(limit_s, signal.SIGALRM, signal.ITIMER_REAL):
         yield
-    finally:
-        try:
-            signal.setitimer(signal.ITIMER_REAL, delay_s)
-        finally:
-            signal.signal(signal.SIGALRM, handler)
 
 
 TOKEN, COLOUR, CATEGORY = "token", "colour", "category"

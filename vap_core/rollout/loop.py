@@ -4,6 +4,7 @@ Nothing here records, or measures success beyond the suite's judge; sinks and ta
 that it yields.
 """
 
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -13,8 +14,17 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import TypeCheckError
 
-from vap_core.base.errors import BadAction, BadCrop, BadPlan, BadStudy, OutOfReach, VapError
+from vap_core.base.errors import (
+    BadAction,
+    BadCrop,
+    BadPart,
+    BadPlan,
+    BadStudy,
+    OutOfReach,
+    VapError,
+)
 from vap_core.base.types import Attended, Views
 from vap_core.policies.protocol import (
     AttentionMaps,
@@ -248,7 +258,9 @@ def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observa
     context = _context(trial, episode)
     drawn_s = episode.env.seconds["render"]
     with _timed(episode.seconds, "attend"):
-        state, attended = trial.prompter.start(_shown(observation), context)
+        shown = _shown(observation)
+        started = [trial.prompter.start(shown, context)]
+        [(state, attended)] = checked_steps(started, trial.prompter, [shown], "start")
     episode.seconds["attend"] -= episode.env.seconds["render"] - drawn_s
     episode.prompter_state = state
     episode.prompting = True
@@ -269,8 +281,10 @@ def _prompt_batch(
         shown = [_shown(observations[id(episode)]) for episode in following]
         contexts = [_context(trial, episode) for episode in following]
         returned = trial.prompter.steps(states, shown, contexts)
-        results = checked_steps(returned, trial.prompter, len(following))
-    except (Exception, SystemExit) as error:
+        results = checked_steps(returned, trial.prompter, shown)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         if _ends_the_run(error):
             raise
         if len(following) == 1:
@@ -514,7 +528,9 @@ def _guard[**P, R](
     """
     try:
         return work(*args, **kwargs)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # sys.exit, and what no library should raise
         if _ends_the_run(error):
             raise
         _fail(episode)
@@ -522,16 +538,20 @@ def _guard[**P, R](
 
 
 def _fail(episode: RunningEpisode) -> None:
-    """End an episode with the exception that is being handled."""
-    episode.outcome = ending(episode, "error", traceback.format_exc(limit=8))
+    """End an episode with the exception that is being handled; its last line is the cause."""
+    detail = traceback.format_exc(limit=8)
+    error = sys.exception()
+    if isinstance(error, TypeCheckError):
+        detail += f"TypeError: {' '.join(str(error).splitlines()[:4])}\n"
+    episode.outcome = ending(episode, "error", detail)
 
 
 def _ends_the_run(error: BaseException) -> bool:
     """Whether the user has to act (a full disk, an absent weight).
 
-    A bad action or plan, and a crop that cannot be embedded, fail their own episode only.
+    A bad action, plan or part, and a crop that cannot be embedded, fail their episode only.
     """
-    of_episode = isinstance(error, OutOfReach | BadAction | BadCrop | BadPlan)
+    of_episode = isinstance(error, OutOfReach | BadAction | BadCrop | BadPart | BadPlan)
     return isinstance(error, VapError) and not of_episode
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vap_core.associate import overrule
 from vap_core.attend import GROUNDING_PX, Attender, AttendState, Prompting
-from vap_core.base.errors import BadInstruction, BadMemory, BadStudy
+from vap_core.base.errors import BadInstruction, BadMemory, BadStudy, number_of
 from vap_core.base.types import (
     Attended,
     Boxes,
@@ -26,7 +26,7 @@ from vap_core.base.types import (
 )
 from vap_core.instruction import parse
 from vap_core.perception.boxes import crop, mask_box
-from vap_core.perception.candidates import Candidates
+from vap_core.perception.candidates import Candidates, draw_masks
 from vap_core.simulation.types import EpisodeRow, Observation
 
 Masks = Mapping[str, Mapping[str, Mask]]
@@ -98,22 +98,32 @@ class Prompter[S](Protocol):
         ...
 
 
-def checked_steps(returned: object, prompter: object, n: int) -> list[tuple[Any, Attended]]:
-    """What `steps` of a prompter returned for `n` episodes.
+def checked_steps(
+    returned: object, prompter: object, observations: Sequence[Observation], call: str = "steps"
+) -> list[tuple[Any, Attended]]:
+    """What a prompter returned for these observations, of which each has pictures.
 
-    Raises: ValueError when it is not a list of one state and one Attended for each episode.
+    Raises: ValueError when it is not a list of one state and one Attended for each, with pictures
+        of the same cameras and sizes.
     """
-    who = f"prompter {type(prompter).__name__}: steps returned"
+    who = f"prompter {type(prompter).__name__}: {call} returned"
+    n = len(observations)
     if not isinstance(returned, list | tuple) or len(returned) != n:
         what = len(returned) if isinstance(returned, list | tuple) else type(returned).__name__
-        episodes = "1 episode" if n == 1 else f"{n} episodes"
+        episodes = number_of(n, "episode")
         raise ValueError(f"{who} {what} results for {episodes}; return a list, one for each")
-    for result in returned:
+    for result, observation in zip(returned, observations, strict=True):
         is_pair = isinstance(result, list | tuple) and len(result) == 2
         if not is_pair or not isinstance(result[1], Attended):
             raise ValueError(
                 f"{who} {type(result).__name__} as a result; return the state and an Attended"
             )
+        seen, shown = (
+            {name: (type(rgb).__name__, *rgb.shape) for name, rgb in of.images.items()}
+            for of in (observation, result[1])
+        )
+        if shown != seen:
+            raise ValueError(f"{who} pictures {shown}; return one for each of {seen}")
     return [(state, attended) for state, attended in returned]
 
 
@@ -367,7 +377,7 @@ class OraclePrompter(TintPrompter):
         xyxy = np.array([mask_box(mask) for mask in masks], np.float32).reshape(-1, 4)
         boxes = Boxes(xyxy, np.ones(len(xyxy), np.float32), phrase)
         if self.oracle.reveal == "box":
-            drawn = self.attender.stack.segmenter(rgb, boxes)
+            drawn = draw_masks(self.attender.stack.segmenter, rgb, boxes)
         else:
             spoiled = [spoil(mask, self.oracle.area, self.oracle.shift) for mask in masks]
             drawn = np.array(spoiled, bool).reshape(-1, *rgb.shape[:2])

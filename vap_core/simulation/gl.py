@@ -6,6 +6,7 @@ A missing one raises a clear error and does not end the process.
 import importlib
 import importlib.util
 import os
+import resource
 import subprocess
 import sys
 from functools import cache
@@ -89,9 +90,11 @@ def ensure_gl() -> str:
     what = f"MUJOCO_GL={chosen}" if chosen else f"no back end of {', '.join(BACKENDS)}"
     unset = " unset MUJOCO_GL, or" if chosen else ""
     device = " unset MUJOCO_EGL_DEVICE_ID, or" if "MUJOCO_EGL_DEVICE_ID" in os.environ else ""
+    limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    limit = " raise the limit of memory (ulimit -v), or" if limited else ""
     raise MissingGL(
         f"ensure_gl: {what} {'cannot' if chosen else 'can'} draw without a display ({said}). "
-        f"Mend what is named there;{unset}{device} run: {REMEDY}"
+        f"Mend what is named there;{limit}{unset}{device} run: {REMEDY}"
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import TYPE_CHECKING, Any, Literal
 
-from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied
+from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied, number_of
 from vap_core.base.files import write_atomic, writing
 from vap_core.policies.lerobot.checkpoints import config_field, fingerprint, locate, stamp
 from vap_core.policies.names import MINI, POLICIES, shipped_checkpoint
@@ -383,9 +383,8 @@ def run(
     table = store.read(folder)
     errors = table[table["outcome"] == "error"]
     if len(errors):
-        episodes = f"{len(errors)} episodes are errors"
         print(
-            f"note: {'1 episode is an error' if len(errors) == 1 else episodes}; when the cause is "
+            f"note: {number_of(len(errors), 'episode')} ended in an error; when the cause is "
             f"mended, the same command with --retries {int(errors['attempt'].max())} tries again.",
             file=sys.stderr,
         )

@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vap_core.base.errors import BadOutput, BadRecording, BadStudy, one_of
+from vap_core.base.errors import BadOutput, BadRecording, BadStudy, an, one_of
 from vap_core.base.files import (
     code_digest,
     code_version,
@@ -401,9 +401,9 @@ def failures_text(failures: Failures, limit: int = 20) -> str:
 def failure_row(failures: Failures, number: int) -> dict[str, Any]:
     """The row of one listed failure. Raises: BadStudy for a number that is not listed."""
     if not 0 <= number < len(failures.table):
-        raise BadStudy(
-            f"diagnose: no failure #{number}; there are {len(failures.table)}, counted from 0."
-        )
+        last = len(failures.table) - 1
+        listed = "none is listed" if last < 0 else f"they are #0 to #{last}"
+        raise BadStudy(f"diagnose: no failure #{number}; {listed}.")
     return failures.table.iloc[number].to_dict()
 
 
@@ -618,7 +618,7 @@ def note_changed(outcome: Outcome, row: Mapping[str, Any]) -> None:
 def _note_otherwise(how: str, status: str, steps: int, row: Mapping[str, Any]) -> None:
     if (status, steps) != (row["outcome"], row["steps"]):
         print(
-            f"note: {how}, it is a {status} after {steps} steps "
+            f"note: {how}, it is {an(status)} after {steps} steps "
             f"(was {row['outcome']} after {row['steps']})."
         )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from vap_core.attend import Attender, AttendState, Prompting, are_shown
 from vap_core.base import media
-from vap_core.base.errors import BadInstruction, BadPhoto
+from vap_core.base.errors import BadInstruction, BadPhoto, number_of
 from vap_core.base.events import describe_rejection, is_shared
 from vap_core.base.files import file_fault, writing
 from vap_core.base.media import load_photo, photos_in
@@ -272,7 +272,8 @@ def _format_grounding(grounding: Grounding) -> list[str]:
             "Give candidates with --box, or another picture."
         ]
     k = grounding.similarity.shape[1]
-    lines = [f"{grounding.object} against {len(candidates)} candidates, {k} references vote:"]
+    among, voters = number_of(len(candidates), "candidate"), number_of(k, "reference")
+    lines = [f"{grounding.object} against {among}; the vote of {voters}:"]
     for i, (box, score) in enumerate(zip(candidates.xyxy, candidates.score, strict=True)):
         mark = "->" if i == grounding.winner else "  "
         x0, y0, x1, y1 = box

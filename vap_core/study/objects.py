@@ -21,7 +21,7 @@ import numpy as np
 
 from vap_core import __version__
 from vap_core.attend import Attender
-from vap_core.base.errors import BadObject, BadStudy, command
+from vap_core.base.errors import BadObject, BadStudy, an, command
 from vap_core.base.files import read_rows
 from vap_core.base.media import load_photo
 from vap_core.base.types import Grounding, Rgb, value
@@ -461,7 +461,7 @@ class ObjectMeasurement(Measurement):
             tasks = suites.tasks_of(self.suites, job.name)
             if not tasks:
                 kind = get_object(job.name).category
-                raise BadObject(f"no task of {', '.join(self.suites)} asks for a {kind}")
+                raise BadObject(f"no task of {', '.join(self.suites)} asks for {an(kind)}")
             for suite, task in tasks:
                 study = self.study(suite, task, job.name)
                 slug = f"{job.name}.{suite}.{task}"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from vap_core.base.errors import BadMemory, BadPhoto
+from vap_core.base.errors import BadMemory, BadPhoto, number_of
 from vap_core.base.files import writing
 from vap_core.base.media import is_video, load_mask, load_photo, photos_in, sharp_frames
 from vap_core.base.types import PersonalObject, Rgb, value
@@ -398,7 +398,8 @@ class Trust:
 
     def __str__(self) -> str:
         if self.n < FEWEST:
-            return f"vote not checked: {self.n} references; give {FEWEST} or more, five are best"
+            known = number_of(self.n, "reference")
+            return f"vote not checked: {known}; give {FEWEST} or more, five are best"
         if not self.others + self.background:
             return "vote not checked: nothing else is remembered, and the photos show nothing else"
         text = (

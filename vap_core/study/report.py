@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from vap_core.base.errors import BadOutput, BadRecording, command
+from vap_core.base.errors import BadOutput, BadRecording, command, number_of
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.pictures import write_png
 from vap_core.simulation import suites
@@ -413,7 +413,7 @@ def report_page(
     table = runs.table
     methods = ", ".join(dict.fromkeys(table["method"]))
     won = int(table["outcome"].eq("success").sum())
-    about = f"{len(table)} episodes, {won} of them successes; methods: {methods}."
+    about = f"{number_of(len(table), 'episode')}, {won} of them successes; methods: {methods}."
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Report</title>",
         f"<style>{STYLE}</style></head><body><h1>Report</h1>",

@@ -7,6 +7,7 @@ process that works there) and tables as folders of Parquet parts; episodes are i
 import fcntl
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -68,7 +69,7 @@ def open_run(folder: Path, configuration: Mapping[str, Any]) -> Path:
     if manifest["digest"] != digest(configuration):
         raise BadOutput(
             f"open_run: {folder} holds another run ({differences(manifest, configuration)}); "
-            "choose another folder with --out."
+            f"choose another folder with --out, for example --out {shlex.quote(f'{folder}-2')}."
         )
     return folder
 

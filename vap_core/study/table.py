@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 type Style = Literal["text", "markdown", "html", "csv"]
-FORMULA = re.compile(r"[=@\t\r]|[+-](?![\d.]*$)")
+FORMULA = re.compile(r"[=@\uff1d\uff20\uff0b\uff0d\t\r\n]|[+-](?![\d.]*$)")
 """How a cell begins that a spreadsheet would compute."""
 
 
@@ -28,7 +28,7 @@ def printed(table: "pd.DataFrame | Sequence[Sequence[str]]", style: Style = "tex
         frame = (
             table if isinstance(table, pd.DataFrame) else pd.DataFrame(table[1:], columns=table[0])
         )
-        texts = frame.select_dtypes(["object", "string"]).columns
+        texts = frame.select_dtypes(exclude=["number", "bool"]).columns
         return frame.assign(**{name: frame[name].map(_no_formula) for name in texts}).to_csv(
             index=False
         )
@@ -41,9 +41,7 @@ def printed(table: "pd.DataFrame | Sequence[Sequence[str]]", style: Style = "tex
         lines = "".join(f"<tr>{''.join(row)}</tr>" for row in rows)
         return f"<div class='wide'><table>{lines}</table></div>"
     if style == "markdown":
-        head, *body = [
-            [_no_html(cell).replace("|", "\\|") for cell in row] for row in (head, *body)
-        ]
+        head, *body = [list(map(_in_markdown, row)) for row in (head, *body)]
     form = {"text": "simple", "markdown": "github"}[style]
     text = tabulate(body, headers=head, tablefmt=form, disable_numparse=True)
     return "\n".join(line.rstrip() for line in text.splitlines())
@@ -56,9 +54,13 @@ def text_of(cell: Any) -> str:
     return printable(f"{cell:.6g}" if isinstance(cell, float) else str(cell), "")
 
 
-def _no_html(cell: str) -> str:
-    """Text in which Markdown finds neither a tag nor an entity; "p < 0.001" is neither."""
-    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(r"&(?=#?\w+;)", "&amp;", cell))
+def _in_markdown(cell: str) -> str:
+    """Text in which Markdown finds no tag, entity, link or picture, and no other column.
+
+    "p < 0.001" is no tag.
+    """
+    text = re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(r"&(?=#?\w+;)", "&amp;", cell))
+    return re.sub(r"(\\*)\|", r"\1\1\\|", text.replace("](", "]\\("))
 
 
 def _no_formula(cell: Any) -> Any:

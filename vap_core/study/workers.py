@@ -205,8 +205,8 @@ def _connect(address: str) -> None:
         reason = str(error).strip().splitlines()[0]
         raise BadCluster(
             f"cluster: no Ray cluster answers at {address!r} ({reason:.120}); "
-            "start one with `ray start --head --disable-usage-stats --node-ip-address 127.0.0.1 "
-            "--port 6379`."
+            "start one with `ray start --head --disable-usage-stats --include-dashboard false "
+            "--node-ip-address 127.0.0.1 --port 6379`."
         ) from error
 
 

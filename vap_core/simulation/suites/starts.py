@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from vap_core.base.errors import BadStudy
+from vap_core.base.errors import BadStudy, an
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites.layout import Spot
 from vap_core.simulation.suites.suite import Suite
@@ -127,9 +127,9 @@ def check_category(name: str, suite: Suite, task_name: str, known: Iterable[Suit
     ]
     remedy = f"import it with --category {wanted!r}, if it is one"
     if fitting:
-        remedy = f"take a task with a {model.category}: {', '.join(fitting)}"
+        remedy = f"take a task with {an(model.category)}: {', '.join(fitting)}"
     raise BadStudy(
-        f"--object: {name} is a {model.category}, and {suite.name}/{task_name} asks for a "
+        f"--object: {name} is {an(model.category)}, and {suite.name}/{task_name} asks for a "
         f"{wanted}; {remedy}."
     )
 
