@@ -205,7 +205,8 @@ def tidy(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
     for line in table.to_dict("records"):
         for measure in measures:
             about = {column: line[column] for column in kept}
-            lines.append({**about, "measure": measure, **asdict(line[measure])})
+            numbers = {"n": line[measure].n, **asdict(line[measure])}
+            lines.append({**about, "measure": measure, **numbers})
     return pd.DataFrame(lines)
 
 

@@ -525,7 +525,8 @@ def curve(answers: "pd.DataFrame") -> "pd.DataFrame":
     lines = []
     for (k, step, kind), part in rows.groupby(["k", "step", kind_of(rows)]):
         about = dict(k=k, step=step, kind=kind, objects=part.object.nunique())
-        lines.append({**about, **asdict(said_yes(part))})
+        found = said_yes(part)
+        lines.append({**about, "n": found.n, **asdict(found)})
     return pd.DataFrame(lines)
 
 
@@ -575,7 +576,8 @@ def confusions(answers: "pd.DataFrame") -> "pd.DataFrame":
     ends = final(reading(answers, "as learned"))
     ends = ends[(ends.k == USUAL_K) & (kind_of(ends) == "look-alikes")]
     lines = ends[["suite", "object", "shown"]].rename(columns={"shown": "look-alike"})
-    numbers = pd.DataFrame(list(map(asdict, rates(ends.yes, ends.n))), lines.index)
+    columns = ["n", "value", "low", "high"]
+    numbers = pd.DataFrame(list(map(asdict, rates(ends.yes, ends.n))), lines.index, columns)
     return lines.join(numbers).reset_index(drop=True)
 
 
