@@ -347,7 +347,7 @@ def _around(masks: Sequence[Mask], margin_px: int) -> tuple[slice, slice]:
     return slice(max(0, y - side), y + side), slice(max(0, x - side), x + side)
 
 
-def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> tuple[Path, Path]:
+def write_photo(folder: Path, row: EpisodeRow, camera: str) -> tuple[Path, Path]:
     """Write a photo to inspect, `row`'s opening frame through one camera, and the reference photos
     of its target; returns its path, and their folder. Raises: BadOutput.
     """
@@ -356,7 +356,7 @@ def write_photo(folder: Path, row: EpisodeRow, camera: str, size: int = 448) -> 
     references, photo = folder / "references", folder / "photo.png"
     with writing(folder, "write_photo", "choose another folder"):
         write_views(get_object(row.target), references, replace=True)
-        Image.fromarray(camera_images(row, size=size)[camera]).save(photo)
+        Image.fromarray(camera_images(row, size=448)[camera]).save(photo)
     return photo, references
 
 
@@ -434,7 +434,7 @@ def first_success(episodes: "pd.DataFrame", suite: str, policy: str) -> tuple[st
     return str(line["task"]), int(line["episode"])
 
 
-def steps_figure(episode: Episode, camera: str, pictures: int = 5) -> "Figure":
+def steps_figure(episode: Episode, camera: str) -> "Figure":
     """A row of prompted pictures for each sub-goal, from its first to its last."""
     row = episode.header.row
     parts = [(row.instruction, episode)]
@@ -449,8 +449,8 @@ def steps_figure(episode: Episode, camera: str, pictures: int = 5) -> "Figure":
         middle = (len(words) + 1) // 2
         mark = "✓ success" if part.outcome.success else "✗ failure"
         label = f"{' '.join(words[:middle])}\n{' '.join(words[middle:])}\n{mark}"
-        rows[label] = moments(part.frames, camera, pictures)
-    return film(rows, ["start", *[""] * (pictures - 2), "end"])
+        rows[label] = moments(part.frames, camera, 5)
+    return film(rows, ["start", "", "", "", "end"])
 
 
 def moments(frames: Sequence[Frame], camera: str, count: int = 6) -> list[Rgb]:

@@ -388,11 +388,15 @@ def select(tables: "Mapping[str, pd.DataFrame]", sql: str, asked: str) -> "pd.Da
 def _asked(
     tables: "Mapping[str, pd.DataFrame]", sql: str, asked: str
 ) -> "Iterator[SessionContext]":
-    """A session with some tables; what is wrong with a question to them is one line."""
+    """A session with some tables and FUNCTIONS alone; what is wrong with a question is one line."""
     import pyarrow as pa
+    from datafusion import SessionContext
 
     _check_size(sql)
-    context = _small_context()
+    context = SessionContext()
+    for name in context.udfs():
+        if name not in FUNCTIONS:
+            context.deregister_udf(name)
     for name, table in tables.items():
         arrow = pa.Table.from_pandas(table, preserve_index=False)
         # A table without rows has no batch, and datafusion panics at none.
@@ -423,17 +427,6 @@ def _check_size(condition: str) -> None:
             f"condition: it has {len(condition):,} characters and {deepest} nested brackets; "
             f"{LONGEST:,} and {DEEPEST} are the most."
         )
-
-
-def _small_context() -> "SessionContext":
-    """A session that knows FUNCTIONS alone."""
-    from datafusion import SessionContext
-
-    context = SessionContext()
-    for name in context.udfs():
-        if name not in FUNCTIONS:
-            context.deregister_udf(name)
-    return context
 
 
 @cache

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 from vap_core.base.errors import BadOutput, BadPhoto
 from vap_core.base.files import file_fault, replacing
@@ -436,12 +436,9 @@ def sharp_frames(path: Path, count: int) -> list[Rgb]:
             f"video: {path} has {len(sharpness)} frames, fewer than the {count} that are wanted; "
             "film for some seconds."
         )
-    wanted = set(_best_of_each_part(sharpness, count))
-    chosen = []
-    for number, rgb in enumerate(frames(path)):
-        if number in wanted:
-            chosen.append(rgb)
-    return chosen
+    edges = np.linspace(0, len(sharpness), count + 1).round().astype(int).tolist()
+    wanted = {first + int(sharpness[first:stop].argmax()) for first, stop in pairwise(edges)}
+    return [rgb for number, rgb in enumerate(frames(path)) if number in wanted]
 
 
 class Mp4:
@@ -546,11 +543,3 @@ def _sharpness(rgb: Rgb) -> float:
     import cv2
 
     return float(cv2.Laplacian(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.CV_64F).var())
-
-
-def _best_of_each_part(sharpness: Float64[np.ndarray, " n"], count: int) -> list[int]:
-    edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
-    best = []
-    for first, stop in pairwise(edges.tolist()):
-        best.append(first + int(sharpness[first:stop].argmax()))
-    return best

@@ -224,7 +224,12 @@ def view(
         recording = recovered(recording)
         print(f"wrote {recording}")
     if beside is not None:
-        recording = _combined(recording, beside)
+        from vap_core.recording import combine_recordings
+
+        both = {recording.stem: recording, beside.stem: beside}
+        recording = recording.with_name(f"{recording.stem}-beside-{beside.stem}.rrd")
+        combine_recordings(both, recording)
+        print(f"wrote {recording}")
     if attention and png is not None:
         from vap_core.recording.show import attention_screenshot
 
@@ -234,16 +239,6 @@ def view(
         print(f"wrote {png}")
     else:
         _show_frame(recording, frame, png, mp4)
-
-
-def _combined(one: Path, other: Path) -> Path:
-    """Two recordings in one file, beside the first."""
-    from vap_core.recording import combine_recordings
-
-    out = one.with_name(f"{one.stem}-beside-{other.stem}.rrd")
-    combine_recordings({one.stem: one, other.stem: other}, out)
-    print(f"wrote {out}")
-    return out
 
 
 def _check(recording: Path) -> None:
@@ -327,7 +322,10 @@ def report(
         return
     from vap_core.study.report import report as conclude
 
-    folder = out or _report_folder(runs[0])
+    beside = runs[0] / "report"
+    if runs[0].suffix == ".parquet":
+        beside = Path("data/runs") / f"{runs[0].stem}-report"
+    folder = out or beside
     print(conclude(runs, folder))
     print(f"\nwrote {folder}: report.md, report.html, tables as CSV, pictures")
 
@@ -363,10 +361,3 @@ def publish(
 
     n_episodes = write_table(runs, to, replace=replace, methods=names(methods))
     print(f"wrote {to}: {n_episodes} episodes")
-
-
-def _report_folder(first_run: Path) -> Path:
-    """Where a report goes: into the first run, or beside the runs where that is a table."""
-    if first_run.suffix == ".parquet":
-        return Path("data/runs") / f"{first_run.stem}-report"
-    return first_run / "report"

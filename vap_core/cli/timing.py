@@ -24,7 +24,7 @@ _ABSENT = object()
 
 
 class Parts:
-    """Seconds and calls by part, of functions that are hooked for a while.
+    """Seconds by part, of functions that are hooked for a while.
 
     A part's seconds are without those of the parts that it calls. A part that is hooked as `whole`
     keeps them: inside it, no other part is counted.
@@ -33,7 +33,6 @@ class Parts:
     def __init__(self, clock: Callable[[], float] = time.process_time) -> None:
         self.clock = clock
         self.seconds: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
         self._inside: list[float] = []
         self._whole = False
 
@@ -55,7 +54,6 @@ class Parts:
     ) -> Callable[..., Any]:
         """`work`, whose calls count for `part`."""
         self.seconds.setdefault(part, 0.0)
-        self.calls.setdefault(part, 0)
 
         @functools.wraps(work)
         def counted(*args: Any, **kwargs: Any) -> Any:
@@ -69,7 +67,6 @@ class Parts:
             finally:
                 seconds = self.clock() - start
                 self.seconds[part] += seconds - self._inside.pop()
-                self.calls[part] += 1
                 self._whole = False
                 if self._inside:
                     self._inside[-1] += seconds

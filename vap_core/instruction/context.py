@@ -243,10 +243,10 @@ class Context:
 
         `by` is one person, None for anybody; `day` counts back from today, None for any day.
         """
-        names = []
-        for use in reversed(self.uses):
+
+        def fits(use: Use) -> bool:
             used = datetime.fromisoformat(use.at)
             days = ((self.now or datetime.now(used.tzinfo)).date() - used.date()).days
-            if use.object in self.objects and by in (None, fold(use.by)) and day in (None, days):
-                names.append(use.object)
-        return list(dict.fromkeys(names))
+            return use.object in self.objects and by in (None, fold(use.by)) and day in (None, days)
+
+        return list(dict.fromkeys(use.object for use in reversed(self.uses) if fits(use)))

@@ -572,5 +572,5 @@ def record(
         return sinks[-1]
 
     (episode,) = rollout(replace(trial, attention=QUERIES), [row], observe, batch=1)
-    note_changed(episode.outcome, line)
+    note_changed("run again", episode.outcome.status, episode.outcome.steps, line)
     return path, sinks[0].step if sinks else 0

@@ -140,14 +140,14 @@ def dots(
         labels: list[str] = []
         places: dict[tuple[str, ...], int] = {}
         bold = set()
-        for key in part[[*filter(None, (group,)), line]].astype(str).itertuples(index=False):
+        columns = [*filter(None, (group,)), line]
+        for key in part[columns].astype(str).itertuples(index=False):
             if group and key[0] not in (seen[0] for seen in places):
                 bold.add(len(labels))
                 labels.append(key[0])
             if tuple(key) not in places:
                 places[tuple(key)] = len(labels)
                 labels.append(key[-1])
-        columns = [*filter(None, (group,)), line]
         of_line = part.groupby(columns, sort=False, observed=True)
         most = int(of_line.size().max())
         for row, i, n in zip(

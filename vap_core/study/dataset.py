@@ -63,8 +63,13 @@ def inspect_dataset(
     """
     recorded = open_dataset(path)
     count = recorded.episodes if episodes is None else min(episodes, recorded.episodes)
-    if copy is not None:
-        _check_one_task(recorded, count)
+    tasks = () if copy is None else recorded.tasks(count)
+    if len(tasks) > 1:
+        named = ", ".join(map(repr, tasks[:4])) + (", ..." if len(tasks) > 4 else "")
+        raise BadDataset(
+            f"inspect-dataset: {recorded.folder} has {len(tasks)} tasks ({named}), and --copy "
+            "writes one instruction over all; split it by task (lerobot-edit-dataset), copy each."
+        )
     models = load_own(stack)
     bank = load_bank(memory, models.encoder.name, "inspect-dataset")
     attender = Attender(models, bank, speaker=speaker)
@@ -96,17 +101,6 @@ def inspect_dataset(
     with writing(out, CALLER):
         write_atomic(out / TABLE, printed(_shown(reports), "csv").encode())
     return reports
-
-
-def _check_one_task(recorded: Recorded, episodes: int) -> None:
-    """Raises: BadDataset: the episodes are of several tasks."""
-    tasks = recorded.tasks(episodes)
-    if len(tasks) > 1:
-        named = ", ".join(map(repr, tasks[:4])) + (", ..." if len(tasks) > 4 else "")
-        raise BadDataset(
-            f"inspect-dataset: {recorded.folder} has {len(tasks)} tasks ({named}), and --copy "
-            "writes one instruction over all; split it by task (lerobot-edit-dataset), copy each."
-        )
 
 
 def report_table(reports: Sequence[Row]) -> str:

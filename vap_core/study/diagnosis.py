@@ -40,50 +40,36 @@ def stages(
     Tracked: right in 9 of 10 steps up to the touch. Then: the target touched; carried, or selected;
     success. `trace` is the episode's, where it is known already.
     """
-    columns: dict[str, Any] = {}
-    for name in STAGES:
-        columns[f"stage_{name}"] = None
-    columns["mask_iou"] = None
-    columns["track_right"] = None
+    names = [f"stage_{name}" for name in STAGES]
+    columns: dict[str, Any] = dict.fromkeys((*names, "mask_iou", "track_right"))
     if episode.outcome.status == "error" or not has_truth(episode):
         return columns
     trace = trace or trace_episode(episode)
-    if trace.prompted:
-        columns |= _prompt_stages(trace, thresholds)
     lifted = episode.outcome.success_once
     if trace.rule != "selected":
         lifted = True in carried(trace, thresholds, trace.target)
-    columns["stage_touched"] = any(trace.touches)
-    columns["stage_lifted"] = lifted
-    columns["stage_success"] = episode.outcome.success
-    return columns
+    return {
+        **columns,
+        **(_prompt_stages(trace, thresholds) if trace.prompted else {}),
+        "stage_touched": any(trace.touches),
+        "stage_lifted": lifted,
+        "stage_success": episode.outcome.success,
+    }
 
 
 def _prompt_stages(trace: EpisodeTrace, thresholds: Thresholds) -> dict[str, Any]:
-    proposed = []
-    voted = []
-    masked = []
-    ious = []
-    for view in trace.coverage[0]:
-        if view.pixels >= thresholds.pixels:
-            proposed.append(view.proposal >= thresholds.proposal)
-            voted.append(view.object == trace.target)
-            masked.append(view.iou >= thresholds.iou)
-            ious.append(view.iou)
-    if not ious:
+    views = [view for view in trace.coverage[0] if view.pixels >= thresholds.pixels]
+    if not views:
         return {}
     touched = first_true(trace.touches)
-    until = len(trace.steps) if touched is None else touched
-    right = 0.0
-    judged = verdicts(trace, thresholds, until)
-    if judged:
-        right = float(np.mean([verdict == "right" for _, verdict in judged]))
+    judged = verdicts(trace, thresholds, len(trace.steps) if touched is None else touched)
+    right = float(np.mean([verdict == "right" for _, verdict in judged] or [False]))
     return {
-        "stage_proposed": all(proposed),
-        "stage_voted": all(voted),
-        "stage_masked": all(masked),
+        "stage_proposed": all(view.proposal >= thresholds.proposal for view in views),
+        "stage_voted": all(view.object == trace.target for view in views),
+        "stage_masked": all(view.iou >= thresholds.iou for view in views),
         "stage_tracked": right >= TRACKED,
-        "mask_iou": float(np.mean(ious)),
+        "mask_iou": float(np.mean([view.iou for view in views])),
         "track_right": right,
     }
 
@@ -98,23 +84,19 @@ def diagnose(
     if episode.outcome.status != "failure" or not episode.frames:
         return None
     if episode.subgoals:
-        return diagnose(_deciding_part(episode), thresholds)
+        return diagnose(episode.part(deciding_subgoal(episode)), thresholds)
     if not has_truth(episode):
         return unlabelled(episode)
     trace = trace or trace_episode(episode)
     found = _classify(trace, thresholds)
-    same = []
-    for near in neighbours(thresholds):
-        other = _classify(trace, near)
-        same.append((other.case, other.sub_case) == (found.case, found.sub_case))
+    others = [_classify(trace, near) for near in neighbours(thresholds)]
+    same = [(each.case, each.sub_case) == (found.case, found.sub_case) for each in others]
     return replace(found, confidence=float(np.mean(same)))
 
 
 def explain(episode: Episode) -> Explanation:
     """The trace and the diagnosis of an episode, for its recording."""
     whole = trace_episode(episode) if has_truth(episode) else None
-    if episode.subgoals:
-        return Explanation(whole, diagnose(episode))
     return Explanation(whole, diagnose(episode, trace=whole))
 
 
@@ -137,20 +119,11 @@ def columns(episode: Episode) -> dict[str, Any]:
 
 def deciding_subgoal(episode: Episode) -> int:
     """The first sub-goal that failed, from 0; the last one where none did."""
-    began = min(len(episode.subgoals), len(episode.outcome.subgoals))
-    for stage, outcome in enumerate(episode.outcome.subgoals[:began]):
-        if not outcome.success:
-            return stage
-    return began - 1
-
-
-def _deciding_part(episode: Episode) -> Episode:
-    return episode.part(deciding_subgoal(episode))
+    began = episode.outcome.subgoals[: len(episode.subgoals)]
+    failed = (stage for stage, outcome in enumerate(began) if not outcome.success)
+    return next(failed, len(began) - 1)
 
 
 def _classify(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis:
-    if trace.prompted:
-        found = wrong_prompt(trace, thresholds)
-        if found is not None:
-            return found
-    return failed_manipulation(trace, thresholds)
+    found = wrong_prompt(trace, thresholds) if trace.prompted else None
+    return found or failed_manipulation(trace, thresholds)

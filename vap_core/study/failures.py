@@ -27,7 +27,7 @@ from vap_core.base.files import (
 )
 from vap_core.rollout.types import CASES
 from vap_core.simulation import suites
-from vap_core.simulation.types import EpisodeRow, Outcome
+from vap_core.simulation.types import EpisodeRow
 from vap_core.study import store
 from vap_core.study.diagnosis import STAGES, explain
 from vap_core.study.results import EXECUTED, read_runs, reads_simulator, scene_of
@@ -587,7 +587,7 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
         summary = _summary(path)
         other = why_other(summary, row)
         if not other:
-            _note_otherwise("recorded", summary["outcome"], summary["steps"], row)
+            note_changed("recorded", summary["outcome"], summary["steps"], row)
             return path
     memory = folder / "memory"
     register_personal(study, memory)
@@ -606,16 +606,12 @@ def _recording_of_row(failures: Failures, row: Mapping[str, Any]) -> Path:
         lambda header: Recorder(path, header, explain=explain),
         batch=1,
     )
-    note_changed(episode.outcome, row)
+    note_changed("run again", episode.outcome.status, episode.outcome.steps, row)
     return path
 
 
-def note_changed(outcome: Outcome, row: Mapping[str, Any]) -> None:
-    """Print a line where an episode that was run again ended otherwise than its `row` says."""
-    _note_otherwise("run again", outcome.status, outcome.steps, row)
-
-
-def _note_otherwise(how: str, status: str, steps: int, row: Mapping[str, Any]) -> None:
+def note_changed(how: str, status: str, steps: int, row: Mapping[str, Any]) -> None:
+    """Print a line where an episode ended otherwise, `how` that is known, than its `row` says."""
     if (status, steps) != (row["outcome"], row["steps"]):
         print(
             f"note: {how}, it is {an(status)} after {steps} steps "

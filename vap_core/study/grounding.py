@@ -4,8 +4,8 @@ The answer is the candidates, the votes, the margin and the rewritten instructio
 """
 
 import os.path
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -421,42 +421,27 @@ def ground_clip(
 ) -> tuple[ClipSummary, Path, Path]:
     """Follow the first target of `instruction` through a clip; write an .rrd and an .mp4.
 
-    `always_tint` is Prompting's.
+    Until something is highlighted, every RETRY-th frame is grounded. `always_tint` is Prompting's.
 
     Raises: BadPhoto, BadInstruction, UnknownName, BadOutput.
     """
+    from vap_core.recording import ClipRecorder, ClipStep
+
     frames, hz = _open(path)
     first = next(frames, None)
     if first is None:
         raise BadPhoto(f"ground: {path} has no frame; film for some seconds.")
     attender, _ = _attender(memory, load_own(stack), parsing, always_tint)
-    with claimed_paths(out, path.stem, ".mp4") as (mp4, rrd):
-        found = _follow(attender, chain([first], frames), hz, instruction, objects, mp4, rrd)
-    return found, rrd, mp4
-
-
-def _follow(
-    attender: Attender,
-    frames: Iterable[Rgb],
-    hz: float,
-    instruction: str,
-    objects: Sequence[str] | None,
-    mp4: Path,
-    rrd: Path,
-) -> ClipSummary:
-    """Ground, track, and write every frame; until something is highlighted, every RETRY-th frame is
-    grounded.
-    """
-    from vap_core.recording import ClipRecorder, ClipStep
-
     _, (obj, *_) = attender.understand(instruction, objects)
     grounded, visible, text = None, [], instruction
     notes: tuple[str, ...] = ()
-    with ExitStack() as files:
-        recorder = files.enter_context(ClipRecorder(rrd, CLIP, obj.name, hz))
-        film = files.enter_context(media.Mp4(mp4, hz))
-        state: AttendState | None = None
-        for number, rgb in enumerate(frames):
+    state: AttendState | None = None
+    with (
+        claimed_paths(out, path.stem, ".mp4") as (mp4, rrd),
+        ClipRecorder(rrd, CLIP, obj.name, hz) as recorder,
+        media.Mp4(mp4, hz) as film,
+    ):
+        for number, rgb in enumerate(chain([first], frames)):
             track, prompted = Track(None, 0.0), rgb
             attended: Attended | None = None
             if state is not None:
@@ -479,7 +464,8 @@ def _follow(
     first_seen = len(visible) if grounded is None else grounded
     absent = true_runs([number >= first_seen and not seen for number, seen in enumerate(visible)])
     lost = tuple((start, stop - 1) for start, stop in absent)
-    return ClipSummary(len(visible), grounded, sum(visible), lost, text, obj.name, notes)
+    found = ClipSummary(len(visible), grounded, sum(visible), lost, text, obj.name, notes)
+    return found, rrd, mp4
 
 
 def _open(path: Path) -> tuple[Iterator[Rgb], float]:

@@ -15,6 +15,7 @@ from vap_core.policies.protocol import TEXT
 from vap_core.rollout.prompters import SWITCHED
 from vap_core.rollout.types import Episode, Frame, MaskCoverage
 from vap_core.simulation import robots
+from vap_core.simulation.control import pose_transform
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.robots import Robot
 from vap_core.simulation.suites import suite
@@ -259,9 +260,5 @@ def _switch(episode: Episode) -> tuple[int, str] | None:
 
 def _away_m(robot: Robot, frame: Frame, name: str) -> float:
     """From the gripper to an object, across the table."""
-    from scipy.spatial.transform import Rotation
-
-    base_from_tcp = frame.state[:3].astype(float)
-    turn = Rotation.from_quat(robot.base_world[3:], scalar_first=True)
-    tcp_world = turn.apply(base_from_tcp) + robot.base_world[:3]
+    tcp_world = pose_transform(robot.base_world).apply(frame.state[:3].astype(float))
     return float(np.hypot(*(tcp_world - frame.truth.objects_world[name][:3])[:2]))

@@ -16,7 +16,7 @@ import hashlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from itertools import batched, combinations
 from pathlib import Path
 from time import perf_counter, process_time
@@ -116,6 +116,9 @@ class PhotoSet:
         return tuple(sorted(set(self.categories) - {subject.name for subject in self.subjects}))
 
 
+_read_csv = partial(read_rows, caller="measure photos", error=BadPhotoSet)
+
+
 def _wrong(text: str) -> BadPhotoSet:
     return BadPhotoSet(f"measure photos: {text}")
 
@@ -172,10 +175,10 @@ def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], .
     return objects
 
 
-def check_object_folder(path: Path, caller: str = "measure photos") -> None:
+def check_object_folder(path: Path) -> None:
     """Raises: BadPhotoSet: the object of a folder of photos cannot be called as the folder is."""
     if not NAME.fullmatch(path.name):
-        raise BadPhotoSet(f"{caller}: {path} cannot name an object; call it by {NAME_RULE}.")
+        raise _wrong(f"{path} cannot name an object; call it by {NAME_RULE}.")
 
 
 def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
@@ -246,32 +249,25 @@ def _read_masks(
     return found
 
 
-def read_categories(
-    folder: Path, named: Iterable[str], caller: str = "measure photos"
-) -> dict[str, str]:
+def read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
     """The kind of every object: objects.csv's, else its name. Raises: BadPhotoSet."""
     categories = {name: name.replace("_", " ").replace("-", " ").strip() for name in named}
     table = folder / OBJECTS_CSV
     for line, row in _read_csv(table, ("object", "category")) if table.exists() else ():
         if row["object"] not in categories:
-            raise BadPhotoSet(
-                f"{caller}: {table} line {line} names {row['object']!r}, which has no references "
+            raise _wrong(
+                f"{table} line {line} names {row['object']!r}, which has no references "
                 "and is in no scene; mend the name."
             )
         categories[row["object"]] = row["category"]
     for name, category in categories.items():
         categories[name] = plain_category(category)
         if kind_instead(category):
-            raise BadPhotoSet(
-                f"{caller}: {category!r} cannot be a category; write {name},KIND into {table} "
+            raise _wrong(
+                f"{category!r} cannot be a category; write {name},KIND into {table} "
                 "with the kind in words, for example mug-1,cup."
             )
     return categories
-
-
-def _read_csv(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    """Every row with the number of its line. Raises: BadPhotoSet."""
-    return read_rows(path, columns, caller="measure photos", error=BadPhotoSet)
 
 
 def _parse_box(row: Mapping[str, str], where: str) -> Box | None:

@@ -194,8 +194,8 @@ def summary(
 _share = share
 
 
-def tidy(table: "pd.DataFrame", measures: Sequence[str], name: str = "measure") -> "pd.DataFrame":
-    """A table whose columns `measures` hold `Estimate`s as one line each: `name`, n, value, low,
+def tidy(table: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
+    """A table whose columns `measures` hold `Estimate`s as one line each: `measure`, n, value, low,
     high, as charts read them.
     """
     import pandas as pd
@@ -205,7 +205,8 @@ def tidy(table: "pd.DataFrame", measures: Sequence[str], name: str = "measure") 
     for line in table.to_dict("records"):
         for measure in measures:
             about = {column: line[column] for column in kept}
-            lines.append({**about, name: measure, **asdict(line[measure])})
+            numbers = {"n": line[measure].n, **asdict(line[measure])}
+            lines.append({**about, "measure": measure, **numbers})
     return pd.DataFrame(lines)
 
 

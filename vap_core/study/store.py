@@ -100,14 +100,12 @@ def differences(manifest: Mapping[str, Any], configuration: Mapping[str, Any]) -
     """Where a run's configuration differs from the one that is wanted now, in words."""
     before = manifest["configuration"]
     now = json.loads(json.dumps(dict(configuration)))
-    changed = []
-    parts = []
-    for name in {**before, **now}:
-        if before.get(name) == now.get(name):
-            continue
-        changed.append(name)
-        if not isinstance(now.get(name), dict | list):
-            parts.append(f"{name} {before.get(name, 'unset')} there, {now.get(name, 'unset')} now")
+    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    parts = [
+        f"{name} {before.get(name, 'unset')} there, {now.get(name, 'unset')} now"
+        for name in changed
+        if not isinstance(now.get(name), dict | list)
+    ]
     return "; ".join(parts or [f"other {', '.join(changed)}"])
 
 

@@ -525,16 +525,17 @@ def curve(answers: "pd.DataFrame") -> "pd.DataFrame":
     lines = []
     for (k, step, kind), part in rows.groupby(["k", "step", kind_of(rows)]):
         about = dict(k=k, step=step, kind=kind, objects=part.object.nunique())
-        lines.append({**about, **asdict(said_yes(part))})
+        found = said_yes(part)
+        lines.append({**about, "n": found.n, **asdict(found)})
     return pd.DataFrame(lines)
 
 
-def readings(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+def readings(answers: "pd.DataFrame") -> "pd.DataFrame":
     """By object and reading: right, and yes to each kind of photo, `Estimate`s."""
     import pandas as pd
 
     lines = []
-    for name, ends in _read_ends(answers, k):
+    for name, ends in _read_ends(answers, USUAL_K):
         for (suite, obj), part in ends.groupby(["suite", "object"], sort=False):
             line = {"suite": suite, "object": obj, "reading": name, "right": right(part)}
             lines.append(line | _yes_by_kind(part))
@@ -568,14 +569,15 @@ def pooled(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
     return pd.DataFrame(lines, columns=["reading", "right", *KINDS]).set_index("reading")
 
 
-def confusions(answers: "pd.DataFrame", k: int = USUAL_K) -> "pd.DataFrame":
+def confusions(answers: "pd.DataFrame") -> "pd.DataFrame":
     """By object and look-alike: the share of its photos that are taken for the object's."""
     import pandas as pd
 
     ends = final(reading(answers, "as learned"))
-    ends = ends[(ends.k == k) & (kind_of(ends) == "look-alikes")]
+    ends = ends[(ends.k == USUAL_K) & (kind_of(ends) == "look-alikes")]
     lines = ends[["suite", "object", "shown"]].rename(columns={"shown": "look-alike"})
-    numbers = pd.DataFrame(list(map(asdict, rates(ends.yes, ends.n))), lines.index)
+    columns = ["n", "value", "low", "high"]
+    numbers = pd.DataFrame(list(map(asdict, rates(ends.yes, ends.n))), lines.index, columns)
     return lines.join(numbers).reset_index(drop=True)
 
 

@@ -247,19 +247,15 @@ def _check_names(study: Study) -> None:
     check_stack(study.stack, "Study")
     for suite, task in study.tasks:
         if not study.rows(suite, task):
-            raise _no_such_split(study.split, suite, task)
+            there = sorted({row.split for row in suites.rows(suite, task)} - {""})
+            known = f"it has {' and '.join(there)}" if there else "its list has no splits"
+            raise BadStudy(f"Study: {suite}/{task} has no split {study.split!r}; {known}.")
         for method in study.methods:
             if suite in suites.SHARED and not suits_shared(method):
                 raise BadStudy(
                     f"Study: {method} knows one object, and {suite} has several; take generic, or "
                     "vap and its variants."
                 )
-
-
-def _no_such_split(split: str, suite: str, task: str) -> BadStudy:
-    there = sorted({row.split for row in suites.rows(suite, task)} - {""})
-    known = f"it has {' and '.join(there)}" if there else "its list has no splits"
-    return BadStudy(f"Study: {suite}/{task} has no split {split!r}; {known}.")
 
 
 def _check_policy(study: Study) -> None:
@@ -344,25 +340,27 @@ def register_personal(study: Study, bank: Path) -> None:
     stack = load_stack(study.stack)
     known = load_bank(bank)
     n_references = max(map(references_needed, study.methods))
-    for suite, task, target in _remembered(study):
+    for suite, task in study.tasks:
         rows = study.rows(suite, task)
-        obj = known.get(target)
-        if obj is None or len(obj.crops) < n_references:
-            model = get_object(target)
-            photos = _photos(model, n_references)
-            obj, _ = register(target, model.category, photos, stack.detector, stack.encoder)
-        if study.any_method(needs_description) and obj.description is None:
-            seen = obj.first(FEWEST_REFERENCES)
-            described = with_description(seen, AttributeCaptioner(stack.segmenter))
-            obj = replace(obj, description=described.description)
-        spaces = {token_space(method) for method in study.methods}
-        if spaces & {"copied", "aligned"}:
-            teach(rows, bank, checkpoints.config_field(study.checkpoint(suite), "vlm"))
-        if "own" in spaces:
-            teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
-        if obj is not known.get(target):
-            save(bank, obj, replace=True)
-            known[target] = obj
+        owned = [owned.model for owned in rows[0].owned]  # in shared scenes
+        for target in owned or [rows[0].target]:
+            obj = known.get(target)
+            if obj is None or len(obj.crops) < n_references:
+                model = get_object(target)
+                photos = _photos(model, n_references)
+                obj, _ = register(target, model.category, photos, stack.detector, stack.encoder)
+            if study.any_method(needs_description) and obj.description is None:
+                seen = obj.first(FEWEST_REFERENCES)
+                described = with_description(seen, AttributeCaptioner(stack.segmenter))
+                obj = replace(obj, description=described.description)
+            spaces = {token_space(method) for method in study.methods}
+            if spaces & {"copied", "aligned"}:
+                teach(rows, bank, checkpoints.config_field(study.checkpoint(suite), "vlm"))
+            if "own" in spaces:
+                teach_own(rows, bank, checkpoints.locate(study.checkpoint(suite)))
+            if obj is not known.get(target):
+                save(bank, obj, replace=True)
+                known[target] = obj
 
 
 def _photos(model: ObjectModel, n: int) -> list[Rgb]:
@@ -374,16 +372,6 @@ def _photos(model: ObjectModel, n: int) -> list[Rgb]:
     if n > FEWEST_REFERENCES:
         photos += reference_views(model, n - FEWEST_REFERENCES, seed=1)
     return photos
-
-
-def _remembered(study: Study) -> list[tuple[str, str, str]]:
-    """Suite, task and object of all that a study remembers; in shared scenes what is owned."""
-    found = []
-    for suite, task in study.tasks:
-        row = study.rows(suite, task)[0]
-        models = [owned.model for owned in row.owned] or [row.target]
-        found += [(suite, task, model) for model in models]
-    return found
 
 
 def make_trial(

@@ -427,23 +427,19 @@ class Scripted:
         late = state.waited_s >= self.motion.patience_s
         there = (level and bool(off[2] < self.motion.arrived_m)) or late
         settled = state.waited_s >= self.motion.close_s
-        if phase == "above" and level and off[2] < 0.03:
-            return "descend"
-        if phase == "descend" and there and command.verb != "touch":
-            return "close"
-        if phase == "close" and settled:
-            return "lift"
         if phase in ("lift", "carry") and opening < self.motion.empty:
             return "above"
-        if phase == "lift" and there and state.spot is not None:
-            return "carry"
-        if phase == "carry" and level:
-            return "lower"
-        if phase == "lower" and there:
-            return "open"
-        if phase == "open" and settled:
-            return "leave"
-        return phase
+        onward: dict[Phase, tuple[bool, Phase]] = {
+            "above": (level and off[2] < 0.03, "descend"),
+            "descend": (there and command.verb != "touch", "close"),
+            "close": (settled, "lift"),
+            "lift": (there and state.spot is not None, "carry"),
+            "carry": (level, "lower"),
+            "lower": (there, "open"),
+            "open": (settled, "leave"),
+        }
+        done, then = onward.get(phase, (False, phase))
+        return then if done else phase
 
     def _aim(self, state: ScriptedState, command: Command) -> tuple[Point, float]:
         """Where the hand should be (base frame, metres) and how far open."""
