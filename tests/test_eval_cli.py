@@ -257,8 +257,8 @@ def test_a_run_of_errors_alone_is_no_success(tmp_path: Path) -> None:
     """It said how many errors there were, and exited with 0."""
     policy = shutil.copytree(shipped("simpler-bridge"), tmp_path / "policy")
     weights = load_file(policy / "model.safetensors")
-    name = next(name for name in weights if name.endswith("action_out_proj.bias"))
-    weights[name] = torch.full_like(weights[name], torch.inf)
+    name = next(name for name in weights if name.endswith("action_out_proj.weight"))
+    weights[name] = torch.full_like(weights[name], torch.finfo(weights[name].dtype).max)
     save_file(weights, policy / "model.safetensors")
     row = ("--suite", "simpler-bridge", "--task", "put-camera", "--episodes", "1")
     words = ("eval", *row, "--policy", policy, "--retries", "0", "--out", tmp_path / "run")

@@ -16,7 +16,7 @@ from lerobot.scripts import lerobot_eval
 from tests import tiny_lerobot as tiny
 from tests.toys import TOYS, personal, scene
 from vap_core import memory
-from vap_core.attend import Attender
+from vap_core.attend import GROUNDING_PX, Attender
 from vap_core.base.errors import BadMemory, BadOutput, BadPolicy, BadSuite, BadViews, UnknownName
 from vap_core.perception.stacks import STACKS, load_stack
 from vap_core.policies.lerobot.adapter import load_policy
@@ -400,8 +400,9 @@ def test_attaching_links_the_frozen_files_and_adds_one_step(whole):
 
 
 def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
-    """Same frozen policy, episodes and per-step VAP: every action is the same in both."""
-    policy, config = load_policy(whole / "act"), VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3)
+    """Same frozen policy, episodes, pictures and per-step VAP: every action is the same in both."""
+    policy = load_policy(whole / "act")
+    config = VapEnvConfig(task=f"{SUITE}/{TASK}", max_steps=3, image_size=GROUNDING_PX)
     before = policy.sha256()
     env = config.create_envs(2)[SUITE][0]
     pipelines = (
@@ -427,6 +428,7 @@ def test_lerobots_own_loop_and_our_rollout_do_the_same(whole):
                 policy=policy,
                 prompter=prompter,
                 sensor=suites.suite(SUITE).sensor,
+                image_size=GROUNDING_PX,
             )
             ours[name] = [
                 np.stack([frame.action for frame in episode.frames[:3]])

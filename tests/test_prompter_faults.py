@@ -123,7 +123,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
             shown_as(lambda image: image[::2]),
             r"pictures {'front': \('ndarray', 112, 224, 3\)}; ret",
         ),
-        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 224, 224, 3\)}; ret"),
+        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 448, 448, 3\)}; ret"),
     ],
 )
 def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
@@ -214,17 +214,17 @@ def boxed(xyxy: Sequence[float], score: float) -> Callable[..., object]:
         (
             "segmenter",
             lambda *_: None,
-            "'Second' gave NoneType  , not ndarray bool .1, 224, 224.; t",
+            "'Second' gave NoneType  , not ndarray bool .1, 448, 448.; t",
         ),
         (
             "segmenter",
             lambda image, boxes: squares(image, boxes)[:0],
-            r"gave ndarray bool \(0, 224, 224\), not ndarray bool \(1, 224, 224\); test",
+            r"gave ndarray bool \(0, 448, 448\), not ndarray bool \(1, 448, 448\); test",
         ),
         (
             "segmenter",
             lambda image, boxes: squares(image, boxes).astype(np.uint8),
-            r"gave ndarray uint8 \(1, 224, 224\), not ndarray bool",
+            r"gave ndarray uint8 \(1, 448, 448\), not ndarray bool",
         ),
         (
             "segmenter",
