@@ -187,7 +187,7 @@ def test_the_contradicted_episode_is_one_that_geometry_mends_if_there_is_any() -
         key = {"suite": "vlabench", "task": "select-cup", "episode": number}
         return [
             {**key, "associate": "off", "case": off},
-            {**key, "associate": "geometry", "case": geometry},
+            {**key, "associate": "associated", "case": geometry},
         ]
 
     never = pd.DataFrame(lines(0, "right", "right") + lines(1, "case 1", "case 2"))
