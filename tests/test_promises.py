@@ -132,7 +132,7 @@ def test_a_table_that_cannot_be_opened_is_not_to_be_deleted(
     def refuse(path: Path) -> None:
         raise error
 
-    monkeypatch.setattr("pyarrow.parquet.read_table", refuse)
+    monkeypatch.setattr("pyarrow.parquet.read_metadata", refuse)
     with pytest.raises(BadOutput, match=reason) as told:
         files.read_parquet(damaged(tmp_path / "a.parquet"), "x", "delete it")
     assert "delete" not in str(told.value)

@@ -123,7 +123,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
             shown_as(lambda image: image[::2]),
             r"pictures {'front': \('ndarray', 112, 224, 3\)}; ret",
         ),
-        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 448, 448, 3\)}; ret"),
+        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 224, 224, 3\)}; ret"),
     ],
 )
 def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
