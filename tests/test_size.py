@@ -12,7 +12,7 @@ from vap_core.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {
-    "= vap_core": {"files": 181, "nodes": 222_300, "functions": 2_560},
+    "= vap_core": {"files": 181, "nodes": 224_500, "functions": 2_545},
     "= vap_make": {"files": 65, "nodes": 74_900, "functions": 790},
 }
 COMMANDS, OPTIONS = 20, 215
