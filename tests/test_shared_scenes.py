@@ -152,8 +152,8 @@ def test_what_the_pairs_training_lacked_and_reached():
 @pytest.mark.sweep
 def test_a_film_of_a_sequence_has_a_row_a_step(tmp_path):
     episode = notebook.run_episode(SUITE, "put-cameras", 0, bank=tmp_path, policy="scripted")
-    figure = notebook.steps_figure(episode, "front")
-    assert len(figure.axes) == 5 * len(episode.subgoals)
+    (sheet,) = notebook.steps_figure(episode, "front").axes
+    assert len(sheet.images) == 5 * len(episode.subgoals)
 
 
 def test_a_policy_that_was_taught_pairs_is_named_apart_from_the_benchmarks_own():

@@ -474,7 +474,9 @@ class Plan:
     task: str = "put-camera"
 
 
-QUICK = Plan(2, 2, {**TOY, "image": 64, "width": 32, "layers": 1, "denoise": 2}, ((1, False),))
+QUICK = Plan(
+    2, 2, {**TOY, "image": 64, "width": 32, "layers": 1, "denoise": 2}, ((1, False), (2, False))
+)
 
 
 class LoopProcess:
