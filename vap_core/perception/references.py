@@ -119,7 +119,7 @@ def choose_references(
         ]
         shown = [part[k : k + 1] for part, k in zip(rows, best, strict=True)]
     references = [
-        _choose(photos[i], proposals[i], best[i], first[i], ballots[i], i in boxes_given)
+        _choose(photos[i], proposals[i], priors[i], best[i], first[i], ballots[i], i in boxes_given)
         for i in range(len(photos))
     ]
     size = np.array([(r.box[2:] - r.box[:2]).prod() / r.photo[..., 0].size for r in references])
@@ -156,6 +156,7 @@ def _boxes_of(photo: Rgb, category: str, detector: Detector, given: Box | None) 
 def _choose(
     photo: Rgb,
     boxes: Boxes,
+    prior: Float[np.ndarray, " n"],
     best: int,
     first: Float[np.ndarray, "k n"],
     ballots: Float[np.ndarray, "k n"],
@@ -163,7 +164,6 @@ def _choose(
 ) -> Reference:
     if not len(boxes):
         return _whole(photo, f"no {boxes.phrase} was found in it")
-    prior = _prior(photo, boxes)
     enough = len(ballots) >= FEWEST - 1
     score = _score(prior, first)
     chosen = boxes.xyxy[best : best + 1]

@@ -215,9 +215,9 @@ def measure_openings(rows: Sequence[EpisodeRow], stack: Stack) -> tuple[list[Row
         offered = find_candidates(episode, stack)
         elected = {}
         for view, of_view in zip(episode, offered, strict=True):
-            few, _ = nominate(view.rgb, personal, of_view, stack)
+            few, cosine = nominate(view.rgb, personal, of_view, stack)
             candidates = segment(view.rgb, few, stack)
-            elected[view.camera] = attender.ground(view.camera, personal, candidates)
+            elected[view.camera] = attender.ground(view.camera, personal, candidates, cosine)
         judged = attender.reject(personal, elected)
         for view, of_view in zip(episode, offered, strict=True):
             row = _view_row(view, of_view, judged[view.camera])

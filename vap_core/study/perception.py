@@ -34,7 +34,7 @@ from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.simulation.studio import reference_views
 from vap_core.simulation.suites.open_row import build_scene, make_env, models_of
 from vap_core.simulation.types import EpisodeRow
-from vap_core.vote import VoteRule, compare, nominate, similarity, vote
+from vap_core.vote import VoteRule, nominate, similarity, vote
 
 VISIBLE_PX = 100
 """Visible pixels, of a view of 224 x 224, from which on an object counts."""
@@ -287,8 +287,7 @@ def _choices(
     target_ious: dict[bytes, float] = {}
     rows = []
     for k, personal in memory.items():
-        few, _ = nominate(view.rgb, personal, candidates, stack)
-        cosine = compare(personal, few, stack)
+        few, cosine = nominate(view.rgb, personal, candidates, stack)
         like = likeness(cosine, few.boxes)
         true_cosine = similarity(true_embeddings, personal.embeddings)
         for rule in RULES:

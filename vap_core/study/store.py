@@ -313,7 +313,7 @@ def encode_table(table: "pa.Table") -> bytes:
     import pyarrow.parquet as pq
 
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
+    pq.write_table(table, sink, compression="zstd", compression_level=22)  # to be carried
     return sink.getvalue().to_pybytes()
 
 
