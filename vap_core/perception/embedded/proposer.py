@@ -270,9 +270,9 @@ REFERENCE_SHARE = 0.95
 """A reference's object may fill the photo."""
 AGREEMENT = 0.05
 AGREEMENT_IOU = 0.5
-"""What a proposal gains in units of cosine where a box of the phrase head agrees with it."""
+"""What a box of a reference photo gains where one of the phrase head agrees with it."""
 OBJECTNESS = 0.05
-"""What a proposal gains for every natural logarithm of its score."""
+"""What it gains for every natural logarithm of its score."""
 
 
 def half_of(image: Rgb) -> Int64[np.ndarray, "2"]:
@@ -288,7 +288,7 @@ def tiles_of(image: Rgb) -> list[tuple[int, int]]:
 
 
 class OpenDetector:
-    """Proposes boxes of any object, with the phrase as evidence."""
+    """Proposes boxes of any object; the phrase says which views are familiar."""
 
     def __init__(self, propose: Propose, by_category: Detector) -> None:
         self.propose = propose
