@@ -8,6 +8,7 @@ where the signature names a shape.
 
 import dataclasses
 import functools
+import inspect
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ import jaxtyping
 from beartype import beartype
 from jaxtyping import AbstractArray, install_import_hook
 from jaxtyping._import_hook import Typechecker
+from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
 WHOLE = jaxtyping.jaxtyped
 
@@ -66,9 +68,23 @@ def _check(function: Callable[..., Any]) -> Callable[..., Any]:
         hints[name] = _resolved(hint, function)
     function.__annotations__ = hints
     checked = beartype(function)
-    if any(_names_a_shape(hint) for hint in hints.values()):
+    dims = " ".join(filter(None, map(_dimensions, hints.values())))
+    if "{" in dims or inspect.isgeneratorfunction(inspect.unwrap(function)):
         return WHOLE(checked, typechecker=None)
-    return checked
+    return _in_a_scope(checked) if dims else checked
+
+
+def _in_a_scope(checked: Callable[..., Any]) -> Callable[..., Any]:
+    """Dimensions of one name are equal in a call; none is an argument's value, so none is bound."""
+
+    def scoped(*args: Any, **kwargs: Any) -> Any:
+        push_shape_memo({})
+        try:
+            return checked(*args, **kwargs)
+        finally:
+            pop_shape_memo()
+
+    return scoped
 
 
 def _resolved(hint: Any, function: Callable[..., Any]) -> Any:
@@ -82,10 +98,11 @@ def _resolved(hint: Any, function: Callable[..., Any]) -> Any:
         return Any
 
 
-def _names_a_shape(hint: Any) -> bool:
+def _dimensions(hint: Any) -> str:
+    """The dimensions of all shapes that a type names."""
     if isinstance(hint, typing.TypeAliasType):
-        return _names_a_shape(hint.__value__)
+        return _dimensions(hint.__value__)
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        return True
+        return f"{hint.dim_str} ."
     parts = hint if isinstance(hint, list) else typing.get_args(hint)
-    return any(_names_a_shape(part) for part in parts)
+    return " ".join(filter(None, map(_dimensions, parts)))

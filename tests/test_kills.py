@@ -108,7 +108,7 @@ Path("kernel").write_text(str(os.getpid()))
 import pandas as pd
 from matplotlib.figure import Figure
 from vap_core.notebook import kept_figure, kept_table""",
-    """for i in range(20):
+    """for i in range(8):
     kept_table(Path(f"table{i}.parquet"), lambda: pd.DataFrame({"n": range(20_000 + i)}), again=True)
     kept_figure(Path(f"figure{i}.png"), lambda: Figure(figsize=(4, 3)), again=True)""",
     """kept_table(Path("table3.parquet"), lambda: None).n.sum()""",
@@ -172,7 +172,7 @@ def test_a_notebook_that_is_killed_leaves_whole_files_and_no_kernel(
     assert not execute(None)
     seconds = time.monotonic() - start
     whole = results()
-    assert len(whole) == 60
+    assert len(whole) == 24
     for path in tmp_path.glob("[ft][ia]*[0-9].*"):
         path.unlink()
     for _ in kill_in(seconds, execute, kills, random.Random(kills)):

@@ -66,7 +66,9 @@ def factor(*rgba: float) -> Callable[[Scene], object]:
 
 
 def colours(path: Path) -> np.ndarray:
-    return np.unique(read_mesh_file(path).rgb, axis=0)
+    """Sorted; one number a colour, since `np.unique` of rows takes a hundred times as long."""
+    whole = np.unique(np.asarray(read_mesh_file(path).rgb, np.int64) @ [1 << 16, 1 << 8, 1])
+    return np.stack([whole >> 16, whole >> 8 & 255, whole & 255], axis=1)
 
 
 @pytest.mark.parametrize("level", [10, 55, 128, 200, 255])

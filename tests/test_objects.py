@@ -89,9 +89,12 @@ def test_generic_is_deterministic_and_ignores_global_seeds():
 def same(name: str) -> bool:
     """Whether the archive has what the generator draws."""
     baked, drawn = get_object(name), draw(name)
-    pairs = [(texture_image(baked), drawn.form.picture())]
+    pairs, meshes = (
+        [(texture_image(baked), drawn.form.picture())],
+        (mesh_of(baked), drawn.form.mesh()),
+    )
     for part in ("vertex", "normal", "uv", "face"):
-        pairs.append((getattr(mesh_of(baked), part), getattr(drawn.form.mesh(), part)))
+        pairs.append(tuple(getattr(mesh, part) for mesh in meshes))
     about = []
     for model in (baked, drawn):
         parts = [asdict(part) for part in (model.texture, *model.form.solids())]

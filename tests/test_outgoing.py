@@ -28,6 +28,21 @@ NETWORK = ("-e", "trace=connect,sendto,sendmsg,sendmmsg")
 SOCKET = re.compile(r"sa_family=AF_INET6?, .*?(?:inet_addr\(|inet_pton\(AF_INET6, )\"([^\"]*)\"")
 
 
+IN_TURN = """
+import json, sys
+from vap_core.cli import main
+
+if __name__ == "__main__":
+    for words in json.loads(sys.argv[1]):
+        sys.argv[1:] = words
+        try:
+            main()
+        except SystemExit as stop:
+            assert not stop.code, (words, stop.code)
+"""
+"""Commands one after the other in one process, which imports what they need once."""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
 def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
@@ -45,15 +60,17 @@ def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
     photo = tmp_path / "camera.png"
     Image.fromarray(reference_views(get_object("camera-personal"), 1)[0]).save(photo)
     row = ("--suite", "simpler-bridge", "--task", "put-camera")
-    ours = (sys.executable, "-m", "vap_core")
     bridge = shipped("simpler-bridge")
     lerobot = Path(sys.executable).with_name("lerobot-eval")
+    ours = (
+        ("register", "camera-personal", "--category", "camera", photo, "--whole", "--memory", bank),
+        ("ground", photo, "bring my camera", "--memory", bank, "--out", tmp_path / "ground"),
+        ("rollout", *row, "--policy", "mini-pi0", "--out", tmp_path / "rollout"),
+        ("eval", *row, "--episodes", "1", "--methods", "vap", "--out", tmp_path / "eval"),
+        ("attach", bridge, tmp_path / "with-vap", "--memory", bank),
+    )
     commands = (
-        (*ours, "register", "camera-personal", "--category", "camera", photo, "--whole", "--memory", bank),
-        (*ours, "ground", photo, "bring my camera", "--memory", bank, "--out", tmp_path / "ground"),
-        (*ours, "rollout", *row, "--policy", "mini-pi0", "--out", tmp_path / "rollout"),
-        (*ours, "eval", *row, "--episodes", "1", "--methods", "vap", "--out", tmp_path / "eval"),
-        (*ours, "attach", bridge, tmp_path / "with-vap", "--memory", bank),
+        (sys.executable, "-c", IN_TURN, json.dumps(ours, default=str)),
         (sys.executable, lerobot, f"--policy.path={tmp_path / 'with-vap'}", "--env.type=vap",
          "--env.task=simpler-bridge/put-camera", "--env.max_steps=3", "--eval.n_episodes=1",
          "--eval.batch_size=1", f"--output_dir={tmp_path / 'lerobot'}"),

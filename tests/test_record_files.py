@@ -135,7 +135,7 @@ def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> No
         work(n)
         return time.process_time() - began
 
-    ratios = [cpu_s(records, n) / cpu_s(encodes, n) for n in range(5)]
+    ratios = [cpu_s(records, n) / cpu_s(encodes, n) for n in range(3)]
     assert (tmp_path / "0.rrd").stat().st_size < 4e6
     assert np.median(ratios) < 10, ratios
 
@@ -175,21 +175,28 @@ def test_two_that_record_one_episode_leave_one_whole(tmp_path: Path) -> None:
     assert other.exists(), "it is young: its process may be alive"
 
 
-@pytest.mark.parametrize("n_bytes", [30_000, 200_000])
-def test_on_a_full_disk_nothing_is_left_of_a_recording(tmp_path: Path, n_bytes: int) -> None:
-    path = tmp_path / "full.rrd"
+def test_on_a_full_disk_nothing_is_left_of_a_recording_and_the_next_one_is_whole(
+    tmp_path: Path,
+) -> None:
+    names = ("early", "late", "whole")
+    early, late, whole = (tmp_path / f"{name}.rrd" for name in names)
     program = (
         f"import sys, pathlib, resource, signal; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from tests import drawn as t\n"
         "from vap_core.base.errors import BadOutput\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes}))\n"
-        "start = t.opening(1)\n"
-        "try:\n"
-        f"    recorder = t.Recorder(pathlib.Path({str(path)!r}), start, flush_every=500)\n"
-        "    for step in range(30): recorder.frame(t.frame(step, start))\n"
-        "    recorder.close(t.SUCCESS)\n"
-        "except BadOutput as error: print(error)\n"
+        "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
+        "kept = []\n"
+        "def record(path, limit):\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))\n"
+        "    start = t.opening(1)\n"
+        "    try:\n"
+        "        kept.append(recorder := t.Recorder(path, start, flush_every=500))\n"
+        "        for step in range(30): recorder.frame(t.frame(step, start))\n"
+        "        recorder.close(t.SUCCESS)\n"
+        "    except BadOutput as error: print(error, sorted(p.name for p in path.parent.iterdir()))\n"
+        f"for name, limit in zip({names!r}, (30_000, 200_000, hard)):\n"
+        f"    record(pathlib.Path({str(tmp_path)!r}, name + '.rrd'), limit)\n"
     )
     try:
         done = subprocess.run(
@@ -197,10 +204,12 @@ def test_on_a_full_disk_nothing_is_left_of_a_recording(tmp_path: Path, n_bytes: 
         )
     except subprocess.TimeoutExpired:
         pytest.xfail("about once in 60 times rerun 0.41 waits forever for a write that failed")
-    assert done.stdout == (
-        f"record: {path} cannot be written; make room and run the same command again.\n"
+    assert done.stdout == "".join(
+        f"record: {path} cannot be written; make room and run the same command again. []\n"
+        for path in (early, late)
     )
-    assert not list(tmp_path.iterdir())
+    assert read_summary(whole)["frames"] == 30
+    assert list(tmp_path.iterdir()) == [whole]
 
 
 def test_a_disk_with_little_room_ends_a_recording_before_rerun_writes(
@@ -223,35 +232,6 @@ def test_a_disk_with_little_room_ends_a_recording_before_rerun_writes(
         again.frame(frame(0, start))
         again.close(SUCCESS)
     assert read_summary(path)["frames"] == 1
-
-
-def test_the_next_recording_of_a_process_is_whole_after_a_full_disk(tmp_path: Path) -> None:
-    first, second = tmp_path / "first.rrd", tmp_path / "second.rrd"
-    program = (
-        f"import sys, pathlib, resource, signal; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "from tests import drawn as t\n"
-        "from vap_core.base.errors import BadOutput\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
-        "kept = []\n"
-        "def record(path):\n"
-        "    start = t.opening(1)\n"
-        "    kept.append(recorder := t.Recorder(pathlib.Path(path), start, flush_every=500))\n"
-        "    for step in range(30): recorder.frame(t.frame(step, start))\n"
-        "    recorder.close(t.SUCCESS)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))\n"
-        "try:\n"
-        f"    record({str(first)!r})\n"
-        "except BadOutput as error: print(error)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))\n"
-        f"record({str(second)!r})\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert "first.rrd cannot be written" in done.stdout
-    assert read_summary(second)["frames"] == 30
-    assert list(tmp_path.iterdir()) == [second]
 
 
 def test_a_folder_that_cannot_be_written_says_so(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import asdict, replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from vap_core.memory import recall
 from vap_core.policies.scripted.scripted import read
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import SHARED, lists, shared
+from vap_core.simulation.suites import SHARED, layout, lists, shared
 from vap_core.simulation.suites.layout import radius_m
 from vap_core.simulation.types import Owned
 from vap_core.study.engine import result_key
@@ -54,13 +55,11 @@ def name(request):
     return request.param
 
 
-def test_a_list_has_twenty_layouts_a_task_and_is_its_builders(name):
+def test_a_list_has_twenty_layouts_a_task(name):
     rows = lists.read(name)
     for task in shared.TASKS[name]:
         mine = [row for row in rows if row.task == task.name]
         assert len(mine) == (24 if name == "shared-sequence-bridge" else 20)
-        for episode in (0, 7, len(mine) - 1):
-            assert asdict(drawn.row(name, task, episode)) == asdict(mine[episode])
 
 
 def test_the_table_of_suites_has_lists_and_hashes(name):
@@ -182,7 +181,12 @@ def test_keys_of_other_results_are_as_before():
     )
 
 
-def test_a_layout_that_was_drawn_again_is_another_and_no_other_row_changes(name, monkeypatch):
+def test_a_list_is_its_builders_and_a_layout_that_was_drawn_again_alone_is_another(
+    name, monkeypatch
+):
+    for often in ("_draw_free_spot", "_is_free"):  # called 100,000 times
+        monkeypatch.setattr(layout, often, getattr(layout, often).__wrapped__)
+    monkeypatch.setattr(drawn, "radius_m", cache(radius_m))
     again = {}
     for task in shared.TASKS[name]:
         for episode, draw in drawn.REDRAWN.get(task.name, {}).items():
