@@ -16,7 +16,15 @@ from vap_core.base.errors import BadStudy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import tint
 from vap_core.rollout.loop import Trial, rollout
-from vap_core.rollout.prompters import SWITCHED, OtherCommand, PromptContext, Switch, SwitchPrompter
+from vap_core.rollout.prompters import (
+    SWITCHED,
+    OtherCommand,
+    PromptContext,
+    RelookPrompter,
+    Switch,
+    SwitchPrompter,
+    TintPrompter,
+)
 from vap_core.rollout.types import Frame
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
@@ -79,6 +87,34 @@ def test_the_tint_goes_to_a_lookalike_once_and_stays(
     alone = replace(ROW, placements=ROW.placements[:2])
     with pytest.raises(BadStudy, match="places no look-alike of 'mug'"):
         prompter.start(*looking({"front": LINE}, alone))
+
+
+def test_a_view_without_the_object_is_looked_at_again() -> None:
+    """The hand's camera sees it from step 2 on: it is looked for at steps 1, 2, 4 and so on."""
+    dark, red = np.zeros_like(LINE), tint(LINE, where(LINE, TEAL), RED)
+    for front, wrist, found in (
+        (LINE, [dark, LINE, LINE], [None, 2, 3]),
+        (LINE, [dark, dark, LINE, LINE], [None, None, None, 4]),
+        (dark, [dark, LINE], [None, 2]),
+    ):
+        started = [
+            prompter(Attender(TOYS, {"mug": MUG})) for prompter in (RelookPrompter, TintPrompter)
+        ]
+        context = PromptContext(ROW.instruction)
+        views = observation({"front": front, "wrist": dark})
+        state, attended = started[0].start(views, context)
+        once, _ = started[1].start(views, context)
+        assert ("red" in attended.text) == (front is LINE)
+        for seen, at in zip(wrist, found, strict=True):
+            views = observation({"front": front, "wrist": seen})
+            ((state, attended),) = started[0].steps([state], [views], [context])
+            ((once, plain),) = started[1].steps([once], [views], [context])
+            assert (attended.images["wrist"] == (seen if at is None else red)).all()
+            assert (attended.images["front"] == (red if front is LINE else front)).all()
+            assert ("red" in attended.text) == (front is LINE or at is not None)
+            assert state.frame_index == once.frame_index
+            assert all(event.frame_index == state.frame_index for event in attended.events)
+            assert (plain.images["wrist"] == seen).all(), "vap looks once"
 
 
 def test_reaction_and_obedience_are_read_from_an_episode() -> None:
