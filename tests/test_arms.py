@@ -11,7 +11,7 @@ import pytest
 
 from tests.test_methods import ALIKE, GREY, LINE, MUG, RED, ROW, TEAL, looking, where
 from tests.toys import TOYS, observation, personal
-from vap_core.attend import Attender
+from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
 from vap_core.policies.protocol import PolicyInput
 from vap_core.prompt import tint
@@ -20,7 +20,6 @@ from vap_core.rollout.prompters import (
     SWITCHED,
     OtherCommand,
     PromptContext,
-    RelookPrompter,
     Switch,
     SwitchPrompter,
     TintPrompter,
@@ -98,7 +97,8 @@ def test_a_view_without_the_object_is_looked_at_again() -> None:
         (dark, [dark, LINE], [None, 2]),
     ):
         started = [
-            prompter(Attender(TOYS, {"mug": MUG})) for prompter in (RelookPrompter, TintPrompter)
+            TintPrompter(Attender(TOYS, {"mug": MUG}, Prompting(relook=again)))
+            for again in (True, False)
         ]
         context = PromptContext(ROW.instruction)
         views = observation({"front": front, "wrist": dark})

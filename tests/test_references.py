@@ -121,7 +121,7 @@ def test_boxes_and_masks_are_read_by_the_photos_name(tmp_path):
     for text, message in (
         ("mug-7.png=1,2,3,4", "names no single photo"),
         ("1,2,3,4", "names no single photo"),
-        ("mug-0.png=1,2,3", "is not PHOTO=x0,y0,x1,y1"),
+        ("mug-0.png=1,2,3", "is not x0,y0,x1,y1"),
         ("mug-0.png=5,5,5,9", "has no area"),
         ("mug-0.png=1,2,inf,9", "has no area"),
     ):

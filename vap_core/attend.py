@@ -76,10 +76,11 @@ class Prompting:
     """What is changed in the policy's inputs: by default the paper's method.
 
     The switches are ablations. `associate` goes beyond the paper: calibrated views agree on one
-    object; by default each is grounded by itself. `always_tint` is the paper's rule:
-    the best candidate wins, however unlike the references it is. Without it an object whose best
-    candidate is below the stack's threshold is not in view. `references` is how many of an object's
-    references are used, the first ones; None uses all.
+    object; by default each is grounded by itself. So does `relook`: at steps 1, 2, 4, 8 and so on
+    of a rollout, views in which nothing is tinted are looked at again. `always_tint` is the paper's
+    rule: the best candidate wins, however unlike the references it is. Without it an object whose
+    best candidate is below the stack's threshold is not in view. `references` is how many of an
+    object's references are used, the first ones; None uses all.
 
     Raises: UnknownName, BadStudy, when it is built from what is no rule or count, or from
         a palette with a name twice or a colour without a hue.
@@ -91,6 +92,7 @@ class Prompting:
     rewrite: bool = True
     rule: VoteRule = "vote"
     associate: bool = False
+    relook: bool = False
     always_tint: bool = False
     references: int | None = None
 

@@ -18,6 +18,22 @@ MAX_BOXES = 10
 """Boxes that a detector returns for one phrase in one view."""
 
 
+def parse_box(text: str, told: str, error: type[Exception]) -> Float32[np.ndarray, "4"]:
+    """A box that a person wrote as "x0,y0,x1,y1". Raises: `error`, beginning with `told`."""
+    try:
+        box = np.array([float(word) for word in text.split(",")], np.float32)
+    except ValueError:
+        box = np.empty(0, np.float32)
+    if len(box) != 4:
+        raise error(f"{told} {text!r} is not x0,y0,x1,y1; for example 40,60,180,220.")
+    if not (np.isfinite(box).all() and (box[2:] - box[:2] >= 1).all() and box.max() > 1):
+        raise error(
+            f"{told} {text!r} has no area; give pixels, not fractions; x to the right, y down, far "
+            "corner last."
+        )
+    return box
+
+
 def crop(image: Rgb, box_xyxy: Float[np.ndarray, "4"], margin: float = MARGIN) -> Rgb:
     """The box with `margin` context, clipped to the image.
 

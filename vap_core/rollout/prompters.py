@@ -263,27 +263,11 @@ class TintPrompter:
         contexts: Sequence[PromptContext],
     ) -> list[tuple[AttendState, Attended]]:
         views = [observation.images for observation in observations]
-        return self.attender.steps(states, views)
-
-
-class RelookPrompter(TintPrompter):
-    """Looks again, at steps 1, 2, 4, 8 and so on, in the views in which nothing is tinted yet.
-
-    A camera on the hand sees more once the hand has moved. What is found is followed from then on,
-    and a view that has its object keeps it. The paper votes once.
-    """
-
-    def steps(
-        self,
-        states: Sequence[AttendState],
-        observations: Sequence[Observation],
-        contexts: Sequence[PromptContext],
-    ) -> list[tuple[AttendState, Attended]]:
-        results = super().steps(states, observations, contexts)
-        for i, (before, context) in enumerate(zip(states, contexts, strict=True)):
-            n = before.frame_index + 1
-            if n & (n - 1) == 0 and len(before.trackers) < len(before.ids):
-                results[i] = self._look_again(before, results[i], observations[i], context)
+        results = self.attender.steps(states, views)
+        for i, before in enumerate(states):
+            n, lacks = before.frame_index + 1, len(before.trackers) < len(before.ids)
+            if self.attender.prompting.relook and lacks and n & (n - 1) == 0:
+                results[i] = self._look_again(before, results[i], observations[i], contexts[i])
         return results
 
     def _look_again(
@@ -297,15 +281,23 @@ class RelookPrompter(TintPrompter):
         state, attended = followed
         fresh, again = self.start(observation, context)
         found = [camera for camera in fresh.trackers if camera not in before.trackers]
-        if found and not before.trackers:
-            events = tuple(replace(event, frame_index=state.frame_index) for event in again.events)
-            return replace(fresh, frame_index=state.frame_index), replace(again, events=events)
-        if found:
-            before = replace(before, ids={**before.ids, **{c: fresh.ids[c] for c in found}})
-            tracks = {**attended.tracks, **{c: again.tracks[c] for c in found}}
-            trackers = {**state.trackers, **{c: fresh.trackers[c] for c in found}}
-            return self.attender.follow(before, observation.images, tracks, trackers)
-        return followed
+        if not found:
+            return followed
+        ids, tracks, trackers = (
+            {**old, **{camera: new[camera] for camera in found}}
+            for old, new in (
+                (before.ids, fresh.ids),
+                (attended.tracks, again.tracks),
+                (state.trackers, fresh.trackers),
+            )
+        )
+        told = replace(
+            before if before.trackers else fresh,  # Its colours and its text.
+            frame_index=before.frame_index,
+            ids=ids,
+            visible=before.visible,
+        )
+        return self.attender.follow(told, observation.images, tracks, trackers)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from vap_core.base.pictures import (
 from vap_core.base.types import Attended, Boxes, Grounding, PersonalObject, Rgb, Track, value
 from vap_core.instruction.parsers import Parsing
 from vap_core.memory import load_bank
+from vap_core.perception.boxes import parse_box
 from vap_core.perception.protocols import Stack
 from vap_core.perception.stacks import load_own
 from vap_core.study.cases import true_runs
@@ -85,9 +86,14 @@ def parse_boxes(boxes: Sequence[str], rgb: Rgb) -> Boxes:
     Raises: BadInstruction for a text without four numbers, or that are no box inside the picture.
     """
     height, width = rgb.shape[:2]
-    rows = [_parse_box(text, width, height) for text in boxes]
-    scores = np.ones(len(rows), np.float32)
-    return Boxes(np.asarray(rows, np.float32), scores, "by hand")
+    rows = [parse_box(text, "--box", BadInstruction) for text in boxes]
+    for text, row in zip(boxes, rows, strict=True):
+        if row.min() < 0 or row[2] > width or row[3] > height:
+            raise BadInstruction(
+                f"--box {text!r} is no box inside the picture, which has {width}x{height} pixels "
+                "when upright."
+            )
+    return Boxes(np.array(rows, np.float32), np.ones(len(rows), np.float32), "by hand")
 
 
 def ground_image(
@@ -189,23 +195,6 @@ def write_evidence(folder: Path, stem: str, found: Found) -> tuple[Path, Path]:
             prompted=found.attended.images[CAMERA],
         )
     return png, rrd
-
-
-def _parse_box(text: str, width: int, height: int) -> list[float]:
-    """One box "x0,y0,x1,y1", inside a picture of `width` x `height` pixels."""
-    try:
-        x0, y0, x1, y1 = map(float, text.split(","))
-    except ValueError as error:
-        raise BadInstruction(
-            f"--box {text!r} is not x0,y0,x1,y1; for example --box 40,60,180,220."
-        ) from error
-    inside = x0 >= 0 and y0 >= 0 and x1 <= width and y1 <= height
-    if not (inside and x1 - x0 >= 1 and y1 - y0 >= 1):
-        raise BadInstruction(
-            f"--box {text!r} is no box inside the picture, which has {width}x{height} pixels when "
-            "upright; x to the right, y down, far corner last."
-        )
-    return [x0, y0, x1, y1]
 
 
 def _grounding_to_json(grounding: Grounding) -> dict[str, Any]:

@@ -41,7 +41,7 @@ from vap_core.memory import (
     reference_rows,
     save,
 )
-from vap_core.perception.boxes import box_iou, mask_iou
+from vap_core.perception.boxes import box_iou, mask_iou, parse_box
 from vap_core.perception.candidates import Candidates, Proposals, embed, prove, segment
 from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
 from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
@@ -154,7 +154,7 @@ def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], .
             f"{root} holds no folder of photos; put each object's photos into references/OBJECT."
         )
     boxes = {
-        row["photo"]: _parse_box(row, f"{table} line {line}")
+        row["photo"]: _box_of(row, f"{table} line {line}")
         for line, row in (_read_csv(table, ("photo", *BOX)) if table.exists() else ())
     }
     objects = {}
@@ -200,7 +200,7 @@ def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
                 f"{where} names the scene {row['scene']!r}, which is not in {root}; give its file "
                 "name."
             )
-        box = _parse_box(row, where)
+        box = _box_of(row, where)
         if box is None and name not in known:
             raise _wrong(
                 f"{where} has no box and no references of {name!r}; give one, or put photos into "
@@ -270,25 +270,12 @@ def read_categories(folder: Path, named: Iterable[str]) -> dict[str, str]:
     return categories
 
 
-def _parse_box(row: Mapping[str, str], where: str) -> Box | None:
+def _box_of(row: Mapping[str, str], where: str) -> Box | None:
     """The box of a row; None where all four cells are empty."""
     cells = [row[name] for name in BOX]
-    if not any(cells):
-        return None
-    told = f"{where} has the box {','.join(cells)!r}"
-    try:
-        box = np.array([float(cell) for cell in cells], np.float32)
-    except ValueError as error:
-        raise _wrong(
-            f"{told}; give four numbers x0,y0,x1,y1, or none where the object is absent."
-        ) from error
-    if not np.isfinite(box).all() or not (box[2:] > box[:2]).all():
-        raise _wrong(f"{told} without area; x to the right, y down, far corner last.")
-    if (box[2:] - box[:2] < 1).any() or box.max() <= 1:
-        raise _wrong(
-            f"{told} with a side of a pixel or less; give pixels, not fractions of the picture."
-        )
-    return box
+    return (
+        parse_box(",".join(cells), f"measure photos: {where}", BadPhotoSet) if any(cells) else None
+    )
 
 
 def _sha256(folder: Path) -> str:

@@ -21,7 +21,7 @@ from vap_core.base.media import is_video, load_mask, load_photo, photos_in, shar
 from vap_core.base.types import PersonalObject, Rgb, value
 from vap_core.instruction.context import fold
 from vap_core.memory import load, object_files, object_path, remember
-from vap_core.perception.boxes import mask_box
+from vap_core.perception.boxes import mask_box, parse_box
 from vap_core.perception.candidates import embed_crops
 from vap_core.perception.protocols import Encoder, Stack
 from vap_core.perception.references import (
@@ -165,8 +165,8 @@ def parse_given(
 
     Raises: BadPhoto.
     """
-    split = [(text, *_split(text, photos, "--box", "x0,y0,x1,y1")) for text in boxes]
-    given = {number: _parse_box(text, words) for text, number, words in split}
+    split = [_split(text, photos, "--box", "x0,y0,x1,y1") for text in boxes]
+    given = {number: parse_box(words, "register: --box", BadPhoto) for number, words in split}
     for text in masks:
         number, words = _split(text, photos, "--mask", "MASK.png")
         given[number] = _box_of_mask(Path(words), photos[number])
@@ -363,21 +363,6 @@ def _box_of_mask(mask_path: Path, photo: Path) -> Box:
     if box is None:
         raise BadPhoto(f"register: the mask {mask_path} is dark all over; paint the object white.")
     return box
-
-
-def _parse_box(text: str, words: str) -> Box:
-    try:
-        x0, y0, x1, y1 = map(float, words.split(","))
-    except ValueError as error:
-        raise BadPhoto(
-            f"register: --box {text!r} is not PHOTO=x0,y0,x1,y1; for example --box "
-            "mug-1.jpg=40,60,180,220."
-        ) from error
-    if not (np.isfinite([x0, y0, x1, y1]).all() and x1 - x0 >= 1 and y1 - y0 >= 1):
-        raise BadPhoto(
-            f"register: --box {text!r} has no area; x to the right, y down, far corner last."
-        )
-    return np.array([x0, y0, x1, y1], np.float32)
 
 
 @value
