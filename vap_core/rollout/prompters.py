@@ -266,6 +266,48 @@ class TintPrompter:
         return self.attender.steps(states, views)
 
 
+class RelookPrompter(TintPrompter):
+    """Looks again, at steps 1, 2, 4, 8 and so on, in the views in which nothing is tinted yet.
+
+    A camera on the hand sees more once the hand has moved. What is found is followed from then on,
+    and a view that has its object keeps it. The paper votes once.
+    """
+
+    def steps(
+        self,
+        states: Sequence[AttendState],
+        observations: Sequence[Observation],
+        contexts: Sequence[PromptContext],
+    ) -> list[tuple[AttendState, Attended]]:
+        results = super().steps(states, observations, contexts)
+        for i, (before, context) in enumerate(zip(states, contexts, strict=True)):
+            n = before.frame_index + 1
+            if n & (n - 1) == 0 and len(before.trackers) < len(before.ids):
+                results[i] = self._look_again(before, results[i], observations[i], context)
+        return results
+
+    def _look_again(
+        self,
+        before: AttendState,
+        followed: tuple[AttendState, Attended],
+        observation: Observation,
+        context: PromptContext,
+    ) -> tuple[AttendState, Attended]:
+        """The step with what is found now in views that had nothing."""
+        state, attended = followed
+        fresh, again = self.start(observation, context)
+        found = [camera for camera in fresh.trackers if camera not in before.trackers]
+        if found and not before.trackers:
+            events = tuple(replace(event, frame_index=state.frame_index) for event in again.events)
+            return replace(fresh, frame_index=state.frame_index), replace(again, events=events)
+        if found:
+            before = replace(before, ids={**before.ids, **{c: fresh.ids[c] for c in found}})
+            tracks = {**attended.tracks, **{c: again.tracks[c] for c in found}}
+            trackers = {**state.trackers, **{c: fresh.trackers[c] for c in found}}
+            return self.attender.follow(before, observation.images, tracks, trackers)
+        return followed
+
+
 @dataclass(frozen=True)
 class Oracle:
     """Which stage is replaced by ground truth.

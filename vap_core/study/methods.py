@@ -23,6 +23,7 @@ from vap_core.rollout.prompters import (
     OraclePrompter,
     OtherCommand,
     Prompter,
+    RelookPrompter,
     SoftPrompt,
     Switch,
     SwitchPrompter,
@@ -61,7 +62,14 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
-type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand | Arrow
+@dataclass(frozen=True)
+class Relook:
+    """The method, with later looks in views where the first one found nothing."""
+
+    prompting: Prompting
+
+
+type Arm = Prompting | Oracle | Hidden | Relook | Switch | OtherCommand | Arrow
 
 
 @dataclass(frozen=True)
@@ -218,8 +226,8 @@ ABLATIONS: dict[str, Ablation] = {
         },
     ),
     "association": Ablation(
-        question="Should views agree on one candidate?",
-        arms={},
+        question="Should views agree on one candidate, and look again where none was found?",
+        arms={"vap-relook": Relook(Prompting(associate=True))},
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
         retired=7,
@@ -250,7 +258,16 @@ ARMS: dict[str, Arm] = {
 
 
 type Method = (
-    Prompting | HardPrompt | SoftPrompt | Oracle | Hidden | Switch | OtherCommand | Arrow | None
+    Prompting
+    | HardPrompt
+    | SoftPrompt
+    | Oracle
+    | Hidden
+    | Relook
+    | Switch
+    | OtherCommand
+    | Arrow
+    | None
 )
 
 METHODS: dict[str, Method] = {
@@ -381,7 +398,7 @@ def token_space(method: str) -> str:
 
 
 def needs_stack(method: str) -> bool:
-    return isinstance(find(method), Prompting | Oracle | Hidden | Switch | Arrow)
+    return isinstance(find(method), Prompting | Oracle | Hidden | Relook | Switch | Arrow)
 
 
 def make_prompter(
@@ -406,6 +423,8 @@ def make_prompter(
             return TintPrompter(_attender(how, row, bank, stack))
         case Hidden(prompting=how):
             return TintPrompter(_attender(how, row, bank, stack))
+        case Relook(prompting=how):
+            return RelookPrompter(_attender(how, row, bank, stack))
         case Arrow():
             attender = _attender(Prompting(highlight=False), row, bank, stack)
             return ArrowPrompter(attender, robots.get(suite(row.suite).robot).base_world)
