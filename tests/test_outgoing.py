@@ -65,7 +65,7 @@ def test_our_commands_and_lerobots_look_nothing_up_and_write_nothing_elsewhere(
     ours = (
         ("register", "camera-personal", "--category", "camera", photo, "--whole", "--memory", bank),
         ("ground", photo, "bring my camera", "--memory", bank, "--out", tmp_path / "ground"),
-        ("rollout", *row, "--policy", "mini-pi0", "--out", tmp_path / "rollout"),
+        ("rollout", *row, "--policy", "mini-pi0", "--episodes", "1", "--out", tmp_path / "rollout"),
         ("eval", *row, "--episodes", "1", "--methods", "vap", "--out", tmp_path / "eval"),
         ("attach", bridge, tmp_path / "with-vap", "--memory", bank),
     )
