@@ -4,6 +4,7 @@ import gc
 import os
 import tarfile
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -81,6 +82,18 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demonstrations, "EPISODES", 2)
         return folder, demonstrations.cached(folder, "simpler-bridge", 0, 1)
+
+
+@pytest.fixture(scope="module")
+def short_episodes() -> Generator[None]:
+    """Those of widowx-pick have twelve steps, for what many are run for."""
+    from vap_core.simulation import suites
+
+    suite = suites.SUITES["widowx-pick"]
+    short = tuple(replace(task, max_steps=12) for task in suite.tasks)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(suites.SUITES, suite.name, replace(suite, tasks=short))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -19,7 +18,6 @@ from tests.test_breakdown import TABLE
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.base.files import DATA
 from vap_core.recording import Recorder, read_summary, recover
-from vap_core.simulation import suites
 from vap_core.simulation.types import Outcome
 from vap_core.study import engine
 from vap_core.study import failures as failures_of
@@ -38,6 +36,7 @@ from vap_core.study.results import publish, read_published
 from vap_core.study.store import read_manifest
 from vap_core.study.trials import Study
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
 
 
@@ -45,18 +44,8 @@ def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
     return ((job, work(job)) for job in jobs)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _short_episodes() -> Iterator[None]:
-    """Of twelve steps: many are run again."""
-    suite = suites.SUITES["widowx-pick"]
-    short = tuple(replace(task, max_steps=12) for task in suite.tasks)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(suites.SUITES, suite.name, replace(suite, tasks=short))
-        yield
-
-
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
     folder = tmp_path_factory.mktemp("diagnosed") / "run"
     engine.run(STUDY, folder, record="none", executor=here, progress=False)
     return folder

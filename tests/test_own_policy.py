@@ -64,6 +64,7 @@ def test_the_documented_encoder_is_called_and_has_no_thresholds_of_another(
     assert (again.thresholds, again.verifier) == (shipped.thresholds, shipped.verifier)
 
 
+@pytest.mark.usefixtures("short_episodes")
 def test_the_documented_policy_runs_when_pasted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

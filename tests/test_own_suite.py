@@ -127,7 +127,7 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
     )
     told = run_as_told(command, tmp_path)
     assert told.returncode == 0, told.stderr
-    without = process("report", out, cwd=tmp_path)
+    without = vap("report", out)
     assert without.returncode == 2
     assert without.stderr.endswith(f"An own suite is found by its file: {command}\n")
     monkeypatch.setenv("VAP_SUITES", str(file))

@@ -97,18 +97,17 @@ class Baked:
         before, after = np.load(io.BytesIO(_read(f"{self.name}.npy")))
         picture = after[np.searchsorted(before @ KEY, _image(f"{plain}.webp") @ KEY)]
         rest = f"{self.name}.webp"
-        return picture + _image(rest) if rest in _contents() else picture
-
-
-def _read(name: str) -> bytes:
-    with ZipFile(FORMS) as archive:
-        return archive.read(name)
+        return picture + _image(rest) if rest in _archive().NameToInfo else picture
 
 
 @cache
-def _contents() -> frozenset[str]:
-    with ZipFile(FORMS) as archive:
-        return frozenset(archive.namelist())
+def _archive() -> ZipFile:
+    """In memory: its directory is read once, and forked processes share no place in a file."""
+    return ZipFile(io.BytesIO(FORMS.read_bytes()))
+
+
+def _read(name: str) -> bytes:
+    return _archive().read(name)
 
 
 @cache
@@ -230,7 +229,7 @@ def _red(name: str) -> ObjectModel | None:
     model = BAKED.get(name.removesuffix(RED))
     if model is None or not isinstance(model.form, Baked):
         return None
-    if not model.form.wall_px and f"{name}.npy" not in _contents():
+    if not model.form.wall_px and f"{name}.npy" not in _archive().NameToInfo:
         return None
     texture = replace(model.form.texture, base=RED_PAINT)
     form = replace(model.form, name=name, texture=texture)
