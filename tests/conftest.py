@@ -32,6 +32,8 @@ END_TO_END = {
     "test_sim", "test_soft_prompt", "test_survey_tables", "test_tokens",
 }  # fmt: skip
 """Modules that run whole episodes, trainings or commands: slow, so `make check` leaves them out."""
+LONG = {"test_contracts", "test_kills", "test_objects", "test_outgoing", "test_own_policy", "test_pair_training", "test_same_inputs"}  # fmt: skip
+"""Others that take long."""
 
 
 @pytest.hookimpl(wrapper=True)
@@ -46,11 +48,12 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the slow tests; notebooks and slow modules run first, so that workers end together."""
+    """Mark the slow tests; notebooks and long modules run first, so that workers end together."""
     for item in items:
         if item.path.stem in END_TO_END:
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: item.path.suffix == ".py" and item.path.stem not in END_TO_END)
+    first = END_TO_END | LONG
+    items.sort(key=lambda item: item.path.suffix == ".py" and item.path.stem not in first)
 
 
 settings.register_profile("vap", deadline=None, derandomize=True)
