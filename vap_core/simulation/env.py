@@ -50,6 +50,12 @@ SETTLE_S = 0.3
 DROP_M = 0.0005
 """Objects start this far above the table and settle."""
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+SLEEP = mujoco.mjtEnableBit.mjENBL_SLEEP
+SLEEPERS = (
+    *("tree_asleep", "tree_awake", "body_awake", "dof_awake_ind", "body_awake_ind"),
+    *("parent_awake_ind", "ntree_awake", "nbody_awake", "nparent_awake", "nv_awake"),
+)
+"""What MjData knows of who is asleep, which is no part of its state."""
 
 
 Control = Literal["ee", "joint"]
@@ -59,10 +65,11 @@ Control = Literal["ee", "joint"]
 class Snapshot:
     """Everything that decides how an episode goes on.
 
-    MuJoCo's full integration state, the command, and the last step's contacts.
+    MuJoCo's full integration state and who is asleep, the command, and the last step's contacts.
     """
 
     state: Float64[np.ndarray, " n"]
+    sleepers: Mapping[str, Any]
     command: Setpoint
     row: EpisodeRow
     touch: Touch
@@ -315,11 +322,16 @@ class Env:
         """The present state of the episode."""
         state = np.zeros(mujoco.mj_stateSize(self._model, STATE))
         mujoco.mj_getState(self._model, self._data, state, STATE)
-        return Snapshot(state=state, command=self._command, row=self.row, touch=self._touch)
+        sleepers = {name: np.copy(getattr(self._data, name)) for name in SLEEPERS}
+        return Snapshot(state, sleepers, self._command, self.row, self._touch)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of any Env of the same scene."""
+        mujoco.mj_resetData(self._model, self._data)
         mujoco.mj_setState(self._model, self._data, snapshot.state, STATE)
+        mujoco.mj_forward(self._model, self._data)  # of all: nothing is computed for who sleeps
+        for name, sleepers in snapshot.sleepers.items():
+            setattr(self._data, name, sleepers)
         self._command = snapshot.command
         self._touch = snapshot.touch
         self._begin(snapshot.row)
@@ -340,7 +352,7 @@ class Env:
         self._disturbances = {name: draw_disturbance(self.sensor, row, name) for name in names}
 
     def _place_objects(self, row: EpisodeRow) -> None:
-        """Put the objects of `row` in their places, and park the others without weight."""
+        """Put the objects of `row` in their places, and park the others, asleep."""
         model = self._model
         data = self._data
         offsets = row.start.offsets or [(0.0, 0.0, 0.0)] * len(row.placements)
@@ -350,9 +362,8 @@ class Env:
             position = (place.x + dx, place.y + dy, DROP_M)
             data.joint(f"{place.model}/free").qpos[:] = (*position, *quat)
         for i, name in enumerate(name for name in self.scene.objects if name in self._parked):
-            body = model.body(name)
             data.joint(f"{name}/free").qpos[:] = (*parked(self.robot, i), 1.0, 0.0, 0.0, 0.0)
-            data.xfrc_applied[body.id, :3] = -model.opt.gravity * float(body.subtreemass[0])
+            data.tree_asleep[model.body_treeid[self._body_ids[name]]] = -1  # from the next step on
 
     def _advance(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
         """Advance physics with `ctrl`, one row a step or one for all, and note the contacts."""
@@ -366,28 +377,31 @@ class Env:
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
             watch.update(data.contact.geom, timestep)
+        awake = data.contact.geom.copy()
+        self._update_poses()
+        asleep = data.contact.geom
+        asleep = asleep[(data.body_awake[model.geom_bodyid[asleep]] <= 0).all(axis=1)]
+        partners = contact_partners(self._roles[np.concatenate([awake, asleep])])
+        named = {ARM: ROBOT, STILL: REST, **dict(enumerate(names))}
         self._touch = Touch(
             touched=tuple(names[i] for i in watch.touched),
             pressed_s={names[i]: seconds for i, seconds in watch.pressed_s.items()},
-            contacts=self._contacts(),
+            contacts={named[i]: frozenset(map(named.get, of)) for i, of in partners.items()},
             running_s={names[i]: seconds for i, seconds in watch.running_s.items()},
         )
-        self._update_poses()
-
-    def _contacts(self) -> dict[str, frozenset[str]]:
-        """The present partners of every touching object, as in Truth."""
-        names = {ARM: ROBOT, STILL: REST, **dict(enumerate(self.scene.objects))}
-        partners = contact_partners(self._roles[self._data.contact.geom])
-        return {names[i]: frozenset(names[role] for role in roles) for i, roles in partners.items()}
 
     def _update_poses(self) -> None:
         """Bring poses up to date with the state, and displace the cameras.
 
-        Contacts and the solver's warm start stay as they are.
+        The contacts are of all objects then: a physics step leaves those among sleepers out. The
+        solver's warm start stays as it is.
         """
         self._cameras = None
         mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
+        self._model.opt.enableflags ^= SLEEP
+        mujoco.mj_camlight(self._model, self._data)  # of cameras that stand still, too
+        mujoco.mj_collision(self._model, self._data)
+        self._model.opt.enableflags ^= SLEEP
         for name, disturbance in self._disturbances.items():
             camera = self._data.camera(name)
             facing = camera.xmat.reshape(3, 3)

@@ -123,6 +123,7 @@ def physics(spec: mujoco.MjSpec, hz: float) -> None:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10.0
     option.noslip_iterations = 4
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
 
 
 def planks(
