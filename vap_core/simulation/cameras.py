@@ -159,11 +159,10 @@ def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np
 
 
 class Renderer:
-    """Renders a model's cameras: colours, and object masks on demand.
+    """Renders a model's cameras with one sample a pixel: colours, and object masks on demand.
 
-    One renderer per picture size for colours and one for masks, shared by every episode. That of
-    the masks has one sample a pixel: the same masks as with several, in two thirds of the time.
-    `objects` names the bodies whose masks can be asked for; a hidden object is not drawn at all.
+    One renderer per picture size, shared by every episode. `objects` names the bodies whose masks
+    can be asked for; a hidden object is not drawn at all.
     """
 
     def __init__(
@@ -172,10 +171,11 @@ class Renderer:
         self.model = model
         self.objects = tuple(objects)
         self.shadows = shadows
-        self._renderers: dict[tuple[int, int, bool], mujoco.Renderer] = {}
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
         self._owner = object_of_geoms(model, self.objects)
         self._hand = hand_geoms(model)
+        model.vis.quality.offsamples = 0
 
     def __enter__(self) -> "Renderer":
         return self
@@ -201,10 +201,9 @@ class Renderer:
 
         `size` is the side of a square, or the height and width, in pixels.
         """
-        renderer = self._renderer(size, masks=False)
-        self._update(renderer, data, name, hidden=hidden, before=before)
+        renderer = self._updated(data, name, size, hidden, before, ids=False)
         dim(renderer.scene, light)
-        return np.ascontiguousarray(renderer.render())
+        return renderer.render()
 
     def masks_and_hand(
         self,
@@ -218,50 +217,37 @@ class Renderer:
 
         `before` is in front of the camera.
         """
-        renderer = self._renderer(size, masks=True)
-        self._update(renderer, data, name, hidden=hidden, before=before)
-        drawn = renderer.render()
-        geom = np.where(drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), drawn[..., 0], -1)
-        owner = np.where(geom >= 0, self._owner[geom], -1)
-        masks = {}
-        for i, each in enumerate(self.objects):
-            if each not in hidden:
-                masks[each] = owner == i
-        hand = (geom >= 0) & self._hand[geom]
-        return masks, hand
+        renderer = self._updated(data, name, size, hidden, before, ids=True)
+        owners = np.full(renderer.scene.ngeom + 1, -1)  # of the ids that are drawn as colours
+        for drawn in renderer.scene.geoms[: renderer.scene.ngeom]:
+            if drawn.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geom = drawn.objid
+                owners[drawn.segid + 1] = -2 if self._hand[geom] else self._owner[geom]
+        colours = renderer.render()
+        owner = owners[colours[..., 0] + 256 * colours[..., 1].astype(np.uint16)]
+        masks = {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
+        return masks, owner == -2
 
-    def _renderer(self, size: int | tuple[int, int], *, masks: bool) -> mujoco.Renderer:
-        """The renderer of pictures, or of masks, of this size."""
+    def _updated(
+        self,
+        data: mujoco.MjData,
+        name: str,
+        size: int | tuple[int, int],
+        hidden: frozenset[str],
+        before: Sequence[Screen],
+        *,
+        ids: bool,
+    ) -> mujoco.Renderer:
+        """The renderer of this size, for what camera `name` sees now in colours or in ids."""
         height, width = (size, size) if isinstance(size, int) else size
-        renderer = self._renderers.get((height, width, masks))
+        renderer = self._renderers.get((height, width))
         if renderer is None:
-            quality = self.model.vis.quality
-            samples = quality.offsamples
             buffer = self.model.vis.global_  # MuJoCo draws into 640 x 480 unless told
             buffer.offheight = max(buffer.offheight, height)
             buffer.offwidth = max(buffer.offwidth, width)
             max_geom = self.model.ngeom + 64
-            try:
-                if masks:
-                    quality.offsamples = 0
-                renderer = mujoco.Renderer(self.model, height, width, max_geom=max_geom)
-            finally:
-                quality.offsamples = samples
-            if masks:
-                renderer.enable_segmentation_rendering()
-            self._renderers[height, width, masks] = renderer
-        return renderer
-
-    def _update(
-        self,
-        renderer: mujoco.Renderer,
-        data: mujoco.MjData,
-        name: str,
-        *,
-        hidden: frozenset[str],
-        before: Sequence[Screen],
-    ) -> None:
-        """Set the renderer's scene to what camera `name` sees now."""
+            renderer = mujoco.Renderer(self.model, height, width, max_geom=max_geom)
+            self._renderers[height, width] = renderer
         hidden_objects = [i for i, each in enumerate(self.objects) if each in hidden]
         hidden_geoms = np.isin(self._owner, hidden_objects)
         self.model.geom_group[:] = np.where(hidden_geoms, HIDDEN_GROUP, self._groups)
@@ -272,6 +258,8 @@ class Renderer:
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
         flags[mujoco.mjtRndFlag.mjRND_HAZE] = 0
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = int(self.shadows)
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = int(ids)
+        return renderer
 
 
 def object_of_geoms(model: mujoco.MjModel, objects: Sequence[str]) -> Int64[np.ndarray, " g"]:

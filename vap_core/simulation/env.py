@@ -8,11 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from vap_core.attend import GROUNDING_PX
 from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
-from vap_core.base.types import Camera, Mask, Views, value
+from vap_core.base.types import Camera, Mask, Rgb, Views, value
 from vap_core.simulation import cameras as optics
 from vap_core.simulation.cameras import hand_geoms
 from vap_core.simulation.contacts import (
@@ -143,7 +145,8 @@ class Env:
         self._disturbances: Mapping[str, Disturbance] = {}
         self._touch = Touch()
         self._cameras: tuple[Camera, ...] | None = None
-        """The calibrated cameras, until the poses change."""
+        self._drawn: dict[tuple[str, tuple[int, int]], Rgb] = {}
+        """The calibrated cameras and their pictures, until the poses change."""
         self._command = self._first_command(self.robot.home)
         mujoco.mj_forward(self._model, self._data)
 
@@ -212,6 +215,7 @@ class Env:
     def observe(self) -> Observation:
         """The raw views and the proprioception.
 
+        The first views are drawn in the size in which objects are looked for, and averaged down.
         The latter is the tcp's position (m) and rotation vector from straight down (rad), the
         gripper's opening 0..1, and the joint angles (rad).
         """
@@ -219,20 +223,28 @@ class Env:
 
     def look(self, longer_px: int) -> Views:
         """The views of this moment once more, with `longer_px` pixels on their longer side."""
-        scale = longer_px / max(self.image_hw)
-        height, width = (max(1, round(side * scale)) for side in self.image_hw)
-        return self._views((height, width))
+        return self._views(self._scaled(longer_px))
+
+    def _scaled(self, longer_px: int) -> tuple[int, int]:
+        height, width = self.image_hw
+        scale = longer_px / max(height, width)
+        return max(1, round(height * scale)), max(1, round(width * scale))
 
     def _views(self, hw: tuple[int, int]) -> Views:
         with self._timed("render"):
             light = PLAIN_LIGHT
             if self._row is not None:
                 light = Light(self._row.start.lamp, self._row.start.ambient)
+            opens = self._step() == 0 and max(hw) < GROUNDING_PX
+            drawn_hw = self._scaled(GROUNDING_PX) if opens else hw
             images = {}
             for name in self.camera_names:
-                rgb = self.scene.renderer.rgb(
-                    self._data, name, hw, light=light, **self._shown(name)
-                )
+                if (name, drawn_hw) not in self._drawn:
+                    self._drawn[name, drawn_hw] = self.scene.renderer.rgb(
+                        self._data, name, drawn_hw, light=light, **self._shown(name)
+                    )
+                rgb = self._drawn[name, drawn_hw]
+                rgb = cv2.resize(rgb, hw[::-1], interpolation=cv2.INTER_AREA)
                 if self._row is not None and name in self._disturbances:
                     errors = self._disturbances[name]
                     rgb = apply_sensor(self.sensor, rgb, errors, self._row, name, self._step())
@@ -397,6 +409,7 @@ class Env:
         solver's warm start stays as it is.
         """
         self._cameras = None
+        self._drawn.clear()
         mujoco.mj_kinematics(self._model, self._data)
         self._model.opt.enableflags ^= SLEEP
         mujoco.mj_camlight(self._model, self._data)  # of cameras that stand still, too

@@ -148,6 +148,7 @@ def stage(
         scenes.build(robot, models, style=look(rng)) as scene,
         mujoco.Renderer(scene.model, SIZE, SIZE) as renderer,
     ):
+        scene.model.opt.enableflags = 0  # else a lamp that is moved stays where it was
         data = mujoco.MjData(scene.model)
         rgb: list[np.ndarray] = []
         ids: list[np.ndarray] = []
