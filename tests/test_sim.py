@@ -1,15 +1,18 @@
 """The simulated world: camera goldens, determinism, contacts, parked objects, and grasps that hold."""
 
+from contextlib import closing
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from vap_core.attend import GROUNDING_PX
 from vap_core.base.errors import UnknownName
 from vap_core.base.types import Camera
 from vap_core.simulation import cameras, scenes
 from vap_core.simulation.assets import objects
 from vap_core.simulation.env import Env
+from vap_core.simulation.looks import Sensor
 from vap_core.simulation.suites import WARM_UPS, Judge, Task, layout, rows
 from vap_core.simulation.types import EpisodeRow, Placement
 
@@ -48,8 +51,8 @@ def test_a_known_slab_covers_the_computable_number_of_pixels():
     model = mujoco.MjModel.from_xml_string(SLAB)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with cameras.Renderer(model, ("slab",)) as renderer:
-        seen = renderer.masks_and_hand(data, "down", 224)[0]["slab"]
+    with closing(cameras.Renderer(model, ("slab",))) as renderer:
+        seen = renderer.masks_and_hand(data, "down", (224, 224))[0]["slab"]
     focal = cameras.intrinsics(model, "down", (224, 224))[0, 0]
     assert focal == pytest.approx(112 / np.tan(np.pi / 8))
     assert seen.sum() == pytest.approx(focal**2 * 0.3 * 0.2 / 0.5**2, rel=0.01)
@@ -62,8 +65,8 @@ def test_a_view_need_not_be_square():
     model = mujoco.MjModel.from_xml_string(SLAB)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with cameras.Renderer(model, ("slab",)) as renderer:
-        square = renderer.masks_and_hand(data, "down", 448)[0]["slab"]
+    with closing(cameras.Renderer(model, ("slab",))) as renderer:
+        square = renderer.masks_and_hand(data, "down", (448, 448))[0]["slab"]
         seen = renderer.masks_and_hand(data, "down", (224, 300))[0]["slab"]
         assert renderer.rgb(data, "down", (224, 300)).shape == (224, 300, 3)
     assert seen.shape == (224, 300)
@@ -71,28 +74,45 @@ def test_a_view_need_not_be_square():
     assert np.argwhere(seen).mean(axis=0) + 0.5 == pytest.approx([112, 150], abs=0.6)
 
 
-def test_masks_of_one_sample_a_pixel_are_those_of_several(scene, row):
-    """Masks are drawn with one sample, pictures with four; asked for in turn, neither changes."""
-
-    class SeveralSamples(cameras.Renderer):
-        def _renderer(self, size, *, masks):
-            renderer = super()._renderer((size[0], size[1]), masks=False)
-            renderer.enable_segmentation_rendering()
-            return renderer
-
+def test_masks_are_those_of_mujocos_own_ids(scene, row):
+    """Drawn in the renderer of the pictures; asked for in turn, neither changes."""
     env = Env(scene)
     env.reset(row)
     views, masks = env.observe().images, env.truth(masks=True).masks
-    assert scene.model.vis.quality.offsamples > 1
-    again = env.observe().images
-    assert all((views[camera] == again[camera]).all() for camera in views)
-    with SeveralSamples(scene.model, scene.renderer.objects, scene.renderer.shadows) as several:
+    again = Env(scene)
+    again.restore(env.snapshot())
+    assert same(dict(again.observe().images), dict(views))
+    assert scene.model.vis.quality.offsamples == 0
+    with mujoco.Renderer(scene.model, *env.image_hw) as own:
+        own.enable_segmentation_rendering()
         for camera, of_view in masks.items():
-            wanted = several.masks_and_hand(env._data, camera, env.image_hw, **env._shown(camera))[
-                0
-            ]
-            assert of_view.keys() == wanted.keys()
-            assert all((of_view[name] == wanted[name]).all() for name in wanted)
+            own.update_scene(env._data, camera)
+            geom, kind = np.moveaxis(own.render(), -1, 0)
+            body = np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, scene.model.geom_bodyid[geom], -1)
+            for name, mask in of_view.items():
+                assert np.array_equal(mask, body == scene.model.body(name).id)
+
+
+def test_the_first_views_are_those_in_which_objects_are_looked_for(scene, row, monkeypatch):
+    """One picture a camera is drawn: of four pixels each of the policy's is the mean."""
+    env = Env(scene)
+    env.reset(row)
+    drawn = []
+    rgb = cameras.Renderer.rgb
+    monkeypatch.setattr(
+        cameras.Renderer,
+        "rgb",
+        lambda self, *args, **kw: drawn.append(args) or rgb(self, *args, **kw),
+    )
+    first, larger = env.observe().images, env.look(GROUNDING_PX)
+    assert [name for _, name, _ in drawn] == list(scene.cameras)
+    for camera, view in first.items():
+        assert larger[camera].shape == (448, 448, 3)
+        mean = larger[camera].reshape(224, 2, 224, 2, 3).mean(axis=(1, 3))
+        assert np.abs(view - mean).max() <= 0.5
+    env.step(ACTIONS[0])
+    assert env.observe().images["front"].shape == view.shape
+    assert drawn[-1][2] == env.image_hw, "later views are drawn in their own size"
 
 
 def test_an_environment_gives_views_of_height_and_width(scene, row):
@@ -230,16 +250,43 @@ def test_episodes_that_share_a_scene_do_not_disturb_each_other(suite, scene):
 
 
 def test_snapshot_goes_back_exactly(scene, row):
+    """In any environment of the scene, with who was asleep."""
     env = Env(scene)
     env.reset(row)
+    assert (env._data.tree_asleep >= 0).sum() == len(row.placements)
     env.step(ACTIONS[0])
     kept, seen = env.snapshot(), asdict(env.observe())
     env.step(ACTIONS[1])
     after = asdict(env.truth())
-    env.restore(kept)
-    assert same(asdict(env.observe()), seen)
-    env.step(ACTIONS[1])
-    assert same(asdict(env.truth()), after)
+    for each in (env, Env(scene)):
+        each.restore(kept)
+        assert same(asdict(each.observe()), seen)
+        each.step(ACTIONS[1])
+        assert same(asdict(each.truth()), after)
+
+
+def test_contacts_among_sleepers_stay_in_the_truth(scene, row):
+    """MuJoCo drops them; with sleep off they are the same, and nothing moves by more than a tenth of a millimetre."""
+    sleeping, awake = Env(scene), Env(scene)
+    for env in (sleeping, awake):
+        scene.model.opt.enableflags = mujoco.mjtEnableBit.mjENBL_SLEEP if env is sleeping else 0
+        env.reset(row)
+        for _ in range(30):
+            env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
+    scene.model.opt.enableflags = mujoco.mjtEnableBit.mjENBL_SLEEP
+    assert sleeping._data.ntree_awake == 1 < awake._data.ntree_awake
+    assert sleeping.truth().contacts == awake.truth().contacts != {}
+    for name, pose in awake.truth().objects_world.items():
+        assert sleeping.truth().objects_world[name] == pytest.approx(pose, abs=1e-4)
+
+
+def test_cameras_stand_where_they_were_displaced_once(scene, row):
+    """MuJoCo leaves a camera that stands still as it is: the displacement is of the rig, not of the last step."""
+    env = Env(scene, sensor=Sensor(jitter_m=0.01, jitter_rad=0.01))
+    env.reset(row)
+    (before, *_) = env.cameras()
+    env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
+    assert np.array_equal(env.cameras()[0].pose_world, before.pose_world)
 
 
 def test_objects_that_a_row_does_not_place_are_gone(scene, row):

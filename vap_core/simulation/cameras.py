@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -19,6 +20,8 @@ from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
 
 HIDDEN_GROUP = 5
 """Geom group that is never drawn."""
+HAND = -2
+"""The owner of the gripper's geoms, beside the objects by their index."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 """OpenGL camera axes (y up, looking along -z) to OpenCV's (y down, looking along +z)."""
 
@@ -140,11 +143,18 @@ def intrinsics(
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
+def pose_of(part: Any) -> Float64[np.ndarray, "4 4"]:
+    """The pose in the world of a body, site or camera, as MjData names it."""
+    pose = np.eye(4)
+    pose[:3, :3] = part.xmat.reshape(3, 3)
+    pose[:3, 3] = part.xpos
+    return pose
+
+
 def camera(model: mujoco.MjModel, data: mujoco.MjData, name: str, size: tuple[int, int]) -> Camera:
     """The calibrated camera `name` where it is now; `size` = (height, width) in pixels."""
-    pose = np.eye(4)
-    pose[:3, :3] = data.camera(name).xmat.reshape(3, 3) @ _FLIP
-    pose[:3, 3] = data.camera(name).xpos
+    pose = pose_of(data.camera(name))
+    pose[:3, :3] = pose[:3, :3] @ _FLIP
     height, width = size
     return Camera(
         name=name, width=width, height=height, k=intrinsics(model, name, size), pose_world=pose
@@ -173,15 +183,8 @@ class Renderer:
         self.shadows = shadows
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
-        self._owner = object_of_geoms(model, self.objects)
-        self._hand = hand_geoms(model)
+        self._owner = np.where(hand_geoms(model), HAND, object_of_geoms(model, self.objects))
         model.vis.quality.offsamples = 0
-
-    def __enter__(self) -> "Renderer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         for renderer in self._renderers.values():
@@ -192,14 +195,14 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: int | tuple[int, int],
+        size: tuple[int, int],
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
         light: Light = PLAIN_LIGHT,
     ) -> Rgb:
         """The picture of camera `name`, with `before` in front of it.
 
-        `size` is the side of a square, or the height and width, in pixels.
+        `size` is its height and width in pixels.
         """
         renderer = self._updated(data, name, size, hidden, before, ids=False)
         dim(renderer.scene, light)
@@ -209,7 +212,7 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: int | tuple[int, int],
+        size: tuple[int, int],
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
     ) -> tuple[Mapping[str, Mask], Mask]:
@@ -221,35 +224,33 @@ class Renderer:
         owners = np.full(renderer.scene.ngeom + 1, -1)  # of the ids that are drawn as colours
         for drawn in renderer.scene.geoms[: renderer.scene.ngeom]:
             if drawn.objtype == mujoco.mjtObj.mjOBJ_GEOM:
-                geom = drawn.objid
-                owners[drawn.segid + 1] = -2 if self._hand[geom] else self._owner[geom]
+                owners[drawn.segid + 1] = self._owner[drawn.objid]
         colours = renderer.render()
         owner = owners[colours[..., 0] + 256 * colours[..., 1].astype(np.uint16)]
         masks = {each: owner == i for i, each in enumerate(self.objects) if each not in hidden}
-        return masks, owner == -2
+        return masks, owner == HAND
 
     def _updated(
         self,
         data: mujoco.MjData,
         name: str,
-        size: int | tuple[int, int],
+        size: tuple[int, int],
         hidden: frozenset[str],
         before: Sequence[Screen],
         *,
         ids: bool,
     ) -> mujoco.Renderer:
         """The renderer of this size, for what camera `name` sees now in colours or in ids."""
-        height, width = (size, size) if isinstance(size, int) else size
-        renderer = self._renderers.get((height, width))
+        renderer = self._renderers.get(size)
         if renderer is None:
+            height, width = size
             buffer = self.model.vis.global_  # MuJoCo draws into 640 x 480 unless told
             buffer.offheight = max(buffer.offheight, height)
             buffer.offwidth = max(buffer.offwidth, width)
             max_geom = self.model.ngeom + 64
             renderer = mujoco.Renderer(self.model, height, width, max_geom=max_geom)
-            self._renderers[height, width] = renderer
-        hidden_objects = [i for i, each in enumerate(self.objects) if each in hidden]
-        hidden_geoms = np.isin(self._owner, hidden_objects)
+            self._renderers[size] = renderer
+        hidden_geoms = np.isin(self._owner, [self.objects.index(each) for each in hidden])
         self.model.geom_group[:] = np.where(hidden_geoms, HIDDEN_GROUP, self._groups)
         renderer.update_scene(data, camera=name)
         draw_screens(renderer.scene, before)

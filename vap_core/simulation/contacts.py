@@ -4,16 +4,12 @@ from collections.abc import Mapping
 from dataclasses import field
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool
 
 from vap_core.base.types import value
 from vap_core.simulation.cameras import object_of_geoms
 from vap_core.simulation.scenes import Scene
-
-ARM = -1
-"""The role of the robot's geoms."""
-STILL = -2
-"""The role of the table, the floor and the walls."""
+from vap_core.simulation.types import REST, ROBOT
 
 
 @value
@@ -28,7 +24,7 @@ class Touch:
 
 
 class ContactWatch:
-    """The robot's contacts over the physics steps of one control step; objects by their index.
+    """The robot's contacts over the physics steps of one control step.
 
     `touched` are the objects that the robot touched, in the order of their first contact;
     `pressed_s` the longest unbroken contact of each with the gripper up to now, and `running_s`
@@ -36,63 +32,50 @@ class ContactWatch:
     """
 
     def __init__(
-        self,
-        geom_roles: Int64[np.ndarray, " g"],
-        on_gripper: Bool[np.ndarray, " g"],
-        running_s: dict[int, float],
+        self, roles: np.ndarray, on_gripper: Bool[np.ndarray, " g"], running_s: Mapping[str, float]
     ) -> None:
-        self.touched: dict[int, None] = {}
-        self.pressed_s: dict[int, float] = {}
+        self.touched: dict[str, None] = {}
+        self.pressed_s: dict[str, float] = {}
         self.running_s = running_s
-        self._geom_roles = geom_roles
+        self._roles = roles
         self._on_gripper = on_gripper
         self._pairs: bytes | None = None
-        self._by_gripper: set[int] = set()
+        self._by_gripper: dict[str, None] = {}
 
     def update(self, geoms: np.ndarray, seconds: float) -> None:
         """Add a physics step of `seconds`; `geoms` (c x 2) are the pairs in contact."""
         pairs = geoms.tobytes()
         if pairs != self._pairs:  # else the contacts are those of the step before
             self._pairs = pairs
-            self._find_touched(geoms)
-        if not self._by_gripper:
-            self.running_s = {}
-            return
-        running_s = {}
-        for index in self._by_gripper:
-            running_s[index] = self.running_s.get(index, 0.0) + seconds
-        for index, pressed in running_s.items():
-            self.pressed_s[index] = max(pressed, self.pressed_s.get(index, 0.0))
-        self.running_s = running_s
-
-    def _find_touched(self, geoms: np.ndarray) -> None:
-        """Note the objects in contact with the robot, and those in contact with its gripper."""
-        pairs = self._geom_roles[geoms]
-        objects = pairs.max(axis=1)
-        by_robot = (pairs.min(axis=1) == ARM) & (objects >= 0)
-        by_gripper = by_robot & self._on_gripper[geoms].any(axis=1)
-        self.touched.update(dict.fromkeys(objects[by_robot].tolist()))
-        self._by_gripper = set(objects[by_gripper].tolist())
+            self._by_gripper = {}
+            on_gripper = self._on_gripper[geoms].any(axis=1)
+            for roles, by_gripper in zip(self._roles[geoms].tolist(), on_gripper, strict=True):
+                for name in roles if ROBOT in roles else ():
+                    if name not in (ROBOT, REST):
+                        self.touched[name] = None
+                        if by_gripper:
+                            self._by_gripper[name] = None
+        self.running_s = {
+            name: self.running_s.get(name, 0.0) + seconds for name in self._by_gripper
+        }
+        for name, pressed in self.running_s.items():
+            self.pressed_s[name] = max(pressed, self.pressed_s.get(name, 0.0))
 
 
-def geom_roles(scene: Scene) -> Int64[np.ndarray, " g"]:
-    """Of each geom: the index of its object, or ARM, or STILL."""
+def geom_roles(scene: Scene) -> np.ndarray:
+    """Of each geom the name of its object, or ROBOT, or REST: the table, floor and walls."""
     model = scene.model
-    owners = object_of_geoms(model, tuple(scene.objects))
-    roles = np.where(owners >= 0, owners, STILL)
+    roles = np.array([*scene.objects, REST], object)[object_of_geoms(model, scene.objects)]
     base = int(model.body(scene.robot.links[0]).rootid[0])
-    roles[model.body_rootid[model.geom_bodyid] == base] = ARM
+    roles[model.body_rootid[model.geom_bodyid] == base] = ROBOT
     return roles
 
 
-def contact_partners(pairs: Int64[np.ndarray, "c 2"]) -> dict[int, set[int]]:
-    """Of every object that touches anything: the roles of what it touches."""
-    partners: dict[int, set[int]] = {}
-    for first, second in pairs.tolist():
-        if first == second:
-            continue
-        if first >= 0:
-            partners.setdefault(first, set()).add(second)
-        if second >= 0:
-            partners.setdefault(second, set()).add(first)
-    return partners
+def contact_partners(roles: np.ndarray) -> dict[str, frozenset[str]]:
+    """What every object that touches anything touches; `roles` are those of pairs in contact."""
+    partners: dict[str, set[str]] = {}
+    for pair in roles.tolist():
+        for one, other in (pair, pair[::-1]):
+            if one != other and one not in (ROBOT, REST):
+                partners.setdefault(one, set()).add(other)
+    return {name: frozenset(of) for name, of in partners.items()}

@@ -17,14 +17,7 @@ from vap_core.base.errors import BadAction, BadViews, UnknownName, one_of
 from vap_core.base.types import Camera, Mask, Rgb, Views, value
 from vap_core.simulation import cameras as optics
 from vap_core.simulation.cameras import hand_geoms
-from vap_core.simulation.contacts import (
-    ARM,
-    STILL,
-    ContactWatch,
-    Touch,
-    contact_partners,
-    geom_roles,
-)
+from vap_core.simulation.contacts import ContactWatch, Touch, contact_partners, geom_roles
 from vap_core.simulation.control import (
     Setpoint,
     arm,
@@ -44,7 +37,7 @@ from vap_core.simulation.looks import (
 )
 from vap_core.simulation.occluder import Occlusion, Screen, occluder_screens
 from vap_core.simulation.scenes import Scene, parked
-from vap_core.simulation.types import EE_ACTION, REST, ROBOT, Action, EpisodeRow, Observation, Truth
+from vap_core.simulation.types import EE_ACTION, Action, EpisodeRow, Observation, Truth
 
 import mujoco  # isort: skip  (cameras has chosen a GL back end)
 
@@ -52,7 +45,6 @@ SETTLE_S = 0.3
 DROP_M = 0.0005
 """Objects start this far above the table and settle."""
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-SLEEP = mujoco.mjtEnableBit.mjENBL_SLEEP
 SLEEPERS = (
     *("tree_asleep", "tree_awake", "body_awake", "dof_awake_ind", "body_awake_ind"),
     *("parent_awake_ind", "ntree_awake", "nbody_awake", "nparent_awake", "nv_awake"),
@@ -133,11 +125,8 @@ class Env:
         self._gripper = hand_geoms(scene.model)
         names = (*scene.objects, *self.robot.links)
         self._body_ids = {name: self._model.body(name).id for name in names}
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, self.robot.base_world[3:])
-        base = np.eye(4)
-        base[:3, :3] = turn.reshape(3, 3)
-        base[:3, 3] = self.robot.base_world[:3]
+        mujoco.mj_forward(self._model, self._data)
+        base = optics.pose_of(self._data.body(self.robot.links[0]))
         self._base_from_world = np.linalg.inv(base)
         self._row: EpisodeRow | None = None
         self._placed: tuple[str, ...] = ()
@@ -148,7 +137,6 @@ class Env:
         self._drawn: dict[tuple[str, tuple[int, int]], Rgb] = {}
         """The calibrated cameras and their pictures, until the poses change."""
         self._command = self._first_command(self.robot.home)
-        mujoco.mj_forward(self._model, self._data)
 
     @property
     def row(self) -> EpisodeRow:
@@ -324,11 +312,7 @@ class Env:
 
     def tcp_base(self) -> Float64[np.ndarray, "4 4"]:
         """The gripper's measured pose in the robot base frame."""
-        site = self._data.site("tcp")
-        world = np.eye(4)
-        world[:3, :3] = site.xmat.reshape(3, 3)
-        world[:3, 3] = site.xpos
-        return self._base_from_world @ world
+        return self._base_from_world @ optics.pose_of(self._data.site("tcp"))
 
     def snapshot(self) -> Snapshot:
         """The present state of the episode."""
@@ -381,9 +365,7 @@ class Env:
         """Advance physics with `ctrl`, one row a step or one for all, and note the contacts."""
         model = self._model
         data = self._data
-        names = self.scene.objects
-        running_s = {names.index(name): s for name, s in self._touch.running_s.items()}
-        watch = ContactWatch(self._roles, self._gripper, running_s)
+        watch = ContactWatch(self._roles, self._gripper, self._touch.running_s)
         timestep = float(model.opt.timestep)
         for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
             data.ctrl[self._ctrl] = row
@@ -393,14 +375,8 @@ class Env:
         self._update_poses()
         asleep = data.contact.geom
         asleep = asleep[(data.body_awake[model.geom_bodyid[asleep]] <= 0).all(axis=1)]
-        partners = contact_partners(self._roles[np.concatenate([awake, asleep])])
-        named = {ARM: ROBOT, STILL: REST, **dict(enumerate(names))}
-        self._touch = Touch(
-            touched=tuple(names[i] for i in watch.touched),
-            pressed_s={names[i]: seconds for i, seconds in watch.pressed_s.items()},
-            contacts={named[i]: frozenset(map(named.get, of)) for i, of in partners.items()},
-            running_s={names[i]: seconds for i, seconds in watch.running_s.items()},
-        )
+        contacts = contact_partners(self._roles[np.concatenate([awake, asleep])])
+        self._touch = Touch(tuple(watch.touched), watch.pressed_s, contacts, watch.running_s)
 
     def _update_poses(self) -> None:
         """Bring poses up to date with the state, and displace the cameras.
@@ -411,10 +387,10 @@ class Env:
         self._cameras = None
         self._drawn.clear()
         mujoco.mj_kinematics(self._model, self._data)
-        self._model.opt.enableflags ^= SLEEP
+        flags, self._model.opt.enableflags = self._model.opt.enableflags, 0
         mujoco.mj_camlight(self._model, self._data)  # of cameras that stand still, too
         mujoco.mj_collision(self._model, self._data)
-        self._model.opt.enableflags ^= SLEEP
+        self._model.opt.enableflags = flags
         for name, disturbance in self._disturbances.items():
             camera = self._data.camera(name)
             facing = camera.xmat.reshape(3, 3)

@@ -234,7 +234,7 @@ class Study:
         if own_motions:
             about["motions"] = own_motions
         listed = [(suite, self.rows(suite, task)) for suite, task in self.tasks]
-        return {**about, "world": world.digest(listed)}
+        return {**about, "world": world.digest(listed, world.EDITION)}
 
 
 def _check_names(study: Study) -> None:

@@ -40,7 +40,11 @@ SPELLINGS: dict[type, str] = {
 that is renamed keeps its name here."""
 
 
-def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]]) -> str:
+EDITION = "at rest objects sleep; one sample a pixel, the first views four"
+"""How what a world consists of is simulated and drawn."""
+
+
+def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]], edition: str = "") -> str:
     """Over the cameras that ship and those of the robots used, styles, suites, robots, objects.
 
     `listed` has, task by task, its suite and its rows. A robot enters with every file that its MJCF
@@ -51,7 +55,7 @@ def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]]) -> str:
     for suite, _ in listed:
         robot_name = suites.suite(suite).robot
         rigs[robot_name] = RIGS[robot_name]
-    found = hashlib.sha256(_canonical((rigs, VARIANTS)))
+    found = hashlib.sha256(_canonical((rigs, VARIANTS)) + edition.encode())
     for suite, rows in listed:
         known = suites.suite(suite)
         robot = robots.get(known.robot)
