@@ -82,7 +82,6 @@ def test_masks_are_those_of_mujocos_own_ids(scene, row):
     again = Env(scene)
     again.restore(env.snapshot())
     assert same(dict(again.observe().images), dict(views))
-    assert scene.model.vis.quality.offsamples == 0
     with mujoco.Renderer(scene.model, *env.image_hw) as own:
         own.enable_segmentation_rendering()
         for camera, of_view in masks.items():
@@ -99,20 +98,21 @@ def test_the_first_views_are_those_in_which_objects_are_looked_for(scene, row, m
     env.reset(row)
     drawn = []
     rgb = cameras.Renderer.rgb
-    monkeypatch.setattr(
-        cameras.Renderer,
-        "rgb",
-        lambda self, *args, **kw: drawn.append(args) or rgb(self, *args, **kw),
-    )
+
+    def count(self, data, name, size, **kwargs):
+        drawn.append((name, kwargs["samples"]))
+        return rgb(self, data, name, size, **kwargs)
+
+    monkeypatch.setattr(cameras.Renderer, "rgb", count)
     first, larger = env.observe().images, env.look(GROUNDING_PX)
-    assert [name for _, name, _ in drawn] == list(scene.cameras)
+    assert drawn == [(name, 4) for name in scene.cameras]
     for camera, view in first.items():
         assert larger[camera].shape == (448, 448, 3)
         mean = larger[camera].reshape(224, 2, 224, 2, 3).mean(axis=(1, 3))
         assert np.abs(view - mean).max() <= 0.5
     env.step(ACTIONS[0])
     assert env.observe().images["front"].shape == view.shape
-    assert drawn[-1][2] == env.image_hw, "later views are drawn in their own size"
+    assert drawn[-1][1] == 0, "later views have one sample a pixel"
 
 
 def test_an_environment_gives_views_of_height_and_width(scene, row):

@@ -169,10 +169,10 @@ def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np
 
 
 class Renderer:
-    """Renders a model's cameras with one sample a pixel: colours, and object masks on demand.
+    """Renders a model's cameras: colours, and object masks on demand.
 
-    One renderer per picture size, shared by every episode. `objects` names the bodies whose masks
-    can be asked for; a hidden object is not drawn at all.
+    One renderer per picture size and number of samples a pixel, shared by every episode. `objects`
+    names the bodies whose masks can be asked for; a hidden object is not drawn at all.
     """
 
     def __init__(
@@ -181,10 +181,9 @@ class Renderer:
         self.model = model
         self.objects = tuple(objects)
         self.shadows = shadows
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._renderers: dict[tuple[int, int, int], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
         self._owner = np.where(hand_geoms(model), HAND, object_of_geoms(model, self.objects))
-        model.vis.quality.offsamples = 0
 
     def close(self) -> None:
         for renderer in self._renderers.values():
@@ -199,12 +198,13 @@ class Renderer:
         hidden: frozenset[str] = frozenset(),
         before: Sequence[Screen] = (),
         light: Light = PLAIN_LIGHT,
+        samples: int = 0,
     ) -> Rgb:
         """The picture of camera `name`, with `before` in front of it.
 
-        `size` is its height and width in pixels.
+        `size` is its height and width in pixels; without `samples` a pixel is drawn once.
         """
-        renderer = self._updated(data, name, size, hidden, before, ids=False)
+        renderer = self._updated(data, name, (*size, samples), hidden, before, ids=False)
         dim(renderer.scene, light)
         return renderer.render()
 
@@ -220,7 +220,7 @@ class Renderer:
 
         `before` is in front of the camera.
         """
-        renderer = self._updated(data, name, size, hidden, before, ids=True)
+        renderer = self._updated(data, name, (*size, 0), hidden, before, ids=True)
         owners = np.full(renderer.scene.ngeom + 1, -1)  # of the ids that are drawn as colours
         for drawn in renderer.scene.geoms[: renderer.scene.ngeom]:
             if drawn.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -234,7 +234,7 @@ class Renderer:
         self,
         data: mujoco.MjData,
         name: str,
-        size: tuple[int, int],
+        size: tuple[int, int, int],
         hidden: frozenset[str],
         before: Sequence[Screen],
         *,
@@ -243,7 +243,7 @@ class Renderer:
         """The renderer of this size, for what camera `name` sees now in colours or in ids."""
         renderer = self._renderers.get(size)
         if renderer is None:
-            height, width = size
+            height, width, self.model.vis.quality.offsamples = size
             buffer = self.model.vis.global_  # MuJoCo draws into 640 x 480 unless told
             buffer.offheight = max(buffer.offheight, height)
             buffer.offwidth = max(buffer.offwidth, width)

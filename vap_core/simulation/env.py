@@ -28,7 +28,6 @@ from vap_core.simulation.control import (
 )
 from vap_core.simulation.looks import (
     PERFECT,
-    PLAIN_LIGHT,
     Disturbance,
     Light,
     Sensor,
@@ -44,6 +43,8 @@ import mujoco  # isort: skip  (cameras has chosen a GL back end)
 SETTLE_S = 0.3
 DROP_M = 0.0005
 """Objects start this far above the table and settle."""
+SAMPLES = 4
+"""A pixel, of views in which objects are looked for; all others are drawn with one."""
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 SLEEPERS = (
     *("tree_asleep", "tree_awake", "body_awake", "dof_awake_ind", "body_awake_ind"),
@@ -134,7 +135,7 @@ class Env:
         self._disturbances: Mapping[str, Disturbance] = {}
         self._touch = Touch()
         self._cameras: tuple[Camera, ...] | None = None
-        self._drawn: dict[tuple[str, tuple[int, int]], Rgb] = {}
+        self._drawn: dict[tuple[str, tuple[int, int], int], Rgb] = {}
         """The calibrated cameras and their pictures, until the poses change."""
         self._command = self._first_command(self.robot.home)
 
@@ -203,7 +204,7 @@ class Env:
     def observe(self) -> Observation:
         """The raw views and the proprioception.
 
-        The first views are drawn in the size in which objects are looked for, and averaged down.
+        The first views are drawn as those in which objects are looked for, and averaged down.
         The latter is the tcp's position (m) and rotation vector from straight down (rad), the
         gripper's opening 0..1, and the joint angles (rad).
         """
@@ -211,31 +212,30 @@ class Env:
 
     def look(self, longer_px: int) -> Views:
         """The views of this moment once more, with `longer_px` pixels on their longer side."""
-        return self._views(self._scaled(longer_px))
+        return self._views(self._scaled(longer_px), SAMPLES)
 
     def _scaled(self, longer_px: int) -> tuple[int, int]:
         height, width = self.image_hw
         scale = longer_px / max(height, width)
         return max(1, round(height * scale)), max(1, round(width * scale))
 
-    def _views(self, hw: tuple[int, int]) -> Views:
+    def _views(self, hw: tuple[int, int], samples: int = 0) -> Views:
         with self._timed("render"):
-            light = PLAIN_LIGHT
-            if self._row is not None:
-                light = Light(self._row.start.lamp, self._row.start.ambient)
-            opens = self._step() == 0 and max(hw) < GROUNDING_PX
-            drawn_hw = self._scaled(GROUNDING_PX) if opens else hw
+            light = Light(self.row.start.lamp, self.row.start.ambient)
+            size = hw
+            if self._step() == 0:
+                size, samples = self._scaled(max(GROUNDING_PX, *hw)), SAMPLES
             images = {}
             for name in self.camera_names:
-                if (name, drawn_hw) not in self._drawn:
-                    self._drawn[name, drawn_hw] = self.scene.renderer.rgb(
-                        self._data, name, drawn_hw, light=light, **self._shown(name)
+                key = name, size, samples
+                if key not in self._drawn:
+                    self._drawn[key] = self.scene.renderer.rgb(
+                        self._data, name, size, light=light, samples=samples, **self._shown(name)
                     )
-                rgb = self._drawn[name, drawn_hw]
-                rgb = cv2.resize(rgb, hw[::-1], interpolation=cv2.INTER_AREA)
-                if self._row is not None and name in self._disturbances:
+                rgb = cv2.resize(self._drawn[key], hw[::-1], interpolation=cv2.INTER_AREA)
+                if name in self._disturbances:
                     errors = self._disturbances[name]
-                    rgb = apply_sensor(self.sensor, rgb, errors, self._row, name, self._step())
+                    rgb = apply_sensor(self.sensor, rgb, errors, self.row, name, self._step())
                 images[name] = rgb
         return images
 

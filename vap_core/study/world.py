@@ -40,7 +40,7 @@ SPELLINGS: dict[type, str] = {
 that is renamed keeps its name here."""
 
 
-EDITION = "at rest objects sleep; one sample a pixel, the first views four"
+EDITION = "at rest objects sleep; one sample a pixel, four where objects are looked for"
 """How what a world consists of is simulated and drawn."""
 
 
