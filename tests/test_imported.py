@@ -78,8 +78,8 @@ def test_it_stands_on_the_table_and_holds_its_shape_as_a_cup(shelf):
         assert scene.model.body("my-mug").mass[0] == pytest.approx(
             objects.get_object("my-mug").mass_kg
         )
-        mask = scene.renderer.masks_and_hand(data, "front", 224)[0]["my-mug"]
-        seen = scene.renderer.rgb(data, "front", 224)[mask].astype(int)
+        mask = scene.renderer.masks_and_hand(data, "front", (224, 224))[0]["my-mug"]
+        seen = scene.renderer.rgb(data, "front", (224, 224))[mask].astype(int)
     assert mask.sum() > 300
     assert (seen[:, 0] > 1.8 * seen[:, 2]).mean() > 0.25
     assert (seen[:, 2] > 1.8 * seen[:, 0]).mean() > 0.25

@@ -159,7 +159,9 @@ def test_the_robot_looks_different_and_the_rest_the_same(pair):
     differs = (np.abs(pictures[0] - pictures[1]).max(axis=2) > 8).mean()
     assert 0.01 < differs < 0.4
     masks = [
-        scene.renderer.masks_and_hand(at_home(scene), scene.cameras[0], 224)[0]["cup-personal"]
+        scene.renderer.masks_and_hand(at_home(scene), scene.cameras[0], (224, 224))[0][
+            "cup-personal"
+        ]
         for scene in pair
     ]
     assert (masks[0] & masks[1]).sum() >= 0.8 * (masks[0] | masks[1]).sum() > 0
