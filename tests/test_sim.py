@@ -253,6 +253,7 @@ def test_snapshot_goes_back_exactly(scene, row):
     """In any environment of the scene, with who was asleep."""
     env = Env(scene)
     env.reset(row)
+    env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
     assert (env._data.tree_asleep >= 0).sum() == len(row.placements)
     env.step(ACTIONS[0])
     kept, seen = env.snapshot(), asdict(env.observe())

@@ -46,6 +46,8 @@ DROP_M = 0.0005
 SAMPLES = 4
 """A pixel, of views in which objects are looked for; all others are drawn with one."""
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+SLEEP_M_S = 1e-3
+"""An object that stays slower falls asleep, after ten physics steps."""
 SLEEPERS = (
     *("tree_asleep", "tree_awake", "body_awake", "dof_awake_ind", "body_awake_ind"),
     *("parent_awake_ind", "ntree_awake", "nbody_awake", "nparent_awake", "nv_awake"),
@@ -193,7 +195,9 @@ class Env:
         self._place_objects(row)
         self._touch = Touch()
         self._command = self._first_command(joints)
-        self._advance(self._settle, data.ctrl[self._ctrl].copy())
+        self._model.opt.sleep_tolerance = 0  # while it settles, what is placed stays awake
+        self._advance(np.tile(data.ctrl[self._ctrl], (self._settle, 1)))
+        self._model.opt.sleep_tolerance = SLEEP_M_S
         self._touch = Touch(contacts=self._touch.contacts)
 
     def pursue(self, row: EpisodeRow) -> None:
@@ -268,7 +272,7 @@ class Env:
         after = self._targets(self._command.joints, self._command.gripper)
         with self._timed("physics"):
             ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
-            self._advance(self._substeps, before + ramp * (after - before))
+            self._advance(before + ramp * (after - before))
 
     def is_beyond_limits(self, action: Action) -> bool:
         """Whether an action is far beyond the robot's speed; `step` cuts it to that."""
@@ -361,16 +365,15 @@ class Env:
             data.joint(f"{name}/free").qpos[:] = (*parked(self.robot, i), 1.0, 0.0, 0.0, 0.0)
             data.tree_asleep[model.body_treeid[self._body_ids[name]]] = -1  # from the next step on
 
-    def _advance(self, steps: int, ctrl: Float64[np.ndarray, "..."]) -> None:
-        """Advance physics with `ctrl`, one row a step or one for all, and note the contacts."""
+    def _advance(self, ctrl: Float64[np.ndarray, "n m"]) -> None:
+        """Advance physics with a row of `ctrl` a step, and note the contacts."""
         model = self._model
         data = self._data
         watch = ContactWatch(self._roles, self._gripper, self._touch.running_s)
-        timestep = float(model.opt.timestep)
-        for row in np.broadcast_to(ctrl, (steps, len(self._ctrl))):
+        for row in ctrl:
             data.ctrl[self._ctrl] = row
             mujoco.mj_step(model, data)
-            watch.update(data.contact.geom, timestep)
+            watch.update(data.contact.geom, model.opt.timestep)
         awake = data.contact.geom.copy()
         self._update_poses()
         asleep = data.contact.geom
