@@ -15,6 +15,7 @@ from vap_core.attend import Attender, Prompting
 from vap_core.base.types import Boxes, Rgb
 from vap_core.memory import load, reference_box, register, save
 from vap_core.perception.boxes import box_cover
+from vap_core.perception.candidates import MOST_CANDIDATES
 from vap_core.perception.embedded import proposer
 from vap_core.perception.embedded.encoder import stretch_contrast
 from vap_core.perception.embedded.networks import FOLDER, MANIFEST
@@ -28,7 +29,7 @@ from vap_core.perception.embedded.proposer import (
 )
 from vap_core.perception.protocols import Detector, Stack, Thresholds
 from vap_core.prompt import PALETTE, tint
-from vap_core.vote import MOST_CANDIDATES, RULES, shortlist, vote
+from vap_core.vote import RULES, shortlist, vote
 
 TEAL, SAND = (40, 120, 110), (150, 140, 130)
 CUP_BOX, BOWL_BOX = (4, 20, 16, 32), (24, 20, 36, 32)
@@ -113,6 +114,25 @@ def test_boxes_of_one_category_are_all_candidates() -> None:
 
 
 UNLIKE = scene([(4, 20, SAND)])
+
+
+@pytest.mark.parametrize(("nested", "apart", "kept"), [(0, 9, 4), (3, 6, 6), (9, 2, 8), (3, 0, 3)])
+def test_a_familiar_view_keeps_boxes_until_there_are_candidates_in_four_places(
+    nested: int, apart: int, kept: int
+) -> None:
+    """Of some boxes, each within the one before, and then some others."""
+    inside = [(0, 40, 512 / 2**i, 48) for i in range(nested)]
+    found = boxes(*inside, *((x, 0, x + 5, 8) for x in range(0, 6 * apart, 6)))
+
+    class Given:
+        def __call__(self, rgb: Rgb, *limits: float) -> tuple[np.ndarray, np.ndarray]:
+            return found.xyxy, np.linspace(0.9, 0.5, len(found)).astype(np.float32)
+
+    (seen,) = OpenDetector(Given(), lambda *_: [boxes(CUP_BOX)])([DESK], "cup")
+    assert len(seen) == kept
+    assert (seen.xyxy == found.xyxy[:kept]).all()
+
+
 STRICT = replace(TOYS, thresholds=Thresholds(familiar=0.99, unfamiliar=0.98))
 
 

@@ -16,8 +16,9 @@ from vap_core.base.types import (
     election_scores,
 )
 from vap_core.memory import reference_rows
-from vap_core.perception.boxes import box_cover
+from vap_core.perception.boxes import other_places
 from vap_core.perception.candidates import (
+    MOST_CANDIDATES,
     MOST_COMPARED,
     Candidates,
     Proposals,
@@ -30,11 +31,6 @@ from vap_core.perception.protocols import Stack
 
 VoteRule = Literal["vote", "average", "best"]
 RULES: tuple[str, ...] = get_args(VoteRule)
-
-SAME_PLACE = 0.5
-"""Of two boxes of which the smaller is covered by more than this share, one shows the place."""
-MOST_CANDIDATES = 4
-"""Proposals that are kept as candidates, unless more have votes. Each is segmented."""
 
 
 def similarity(
@@ -95,13 +91,9 @@ def shortlist(
     if len(boxes) <= most:
         return np.arange(len(boxes))
     scores = election_scores(cosine, boxes)
-    cover = box_cover(boxes.xyxy, boxes.xyxy)
     by_mean = np.argsort(-scores.astype(np.float64).mean(axis=1), kind="stable")
     kept = np.union1d(best_of_references(scores), by_mean[:1]).tolist()
-    for i in by_mean.tolist():
-        if len(kept) < most and cover[i, kept].max() <= SAME_PLACE:
-            kept.append(i)
-    return np.sort(np.array(kept, np.int64))
+    return other_places(boxes.xyxy, by_mean, most, kept)
 
 
 def check_rule(rule: str, what: str) -> None:

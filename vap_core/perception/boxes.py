@@ -3,6 +3,8 @@
 Boxes are `x0 y0 x1 y1` in pixels, far corner exclusive.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -16,6 +18,8 @@ NMS_IOU = 0.5
 """A box that overlaps a better one by more than this IoU is suppressed."""
 MAX_BOXES = 10
 """Boxes that a detector returns for one phrase in one view."""
+SAME_PLACE = 0.5
+"""Of two boxes of which the smaller is covered by more than this share, one shows the place."""
 
 
 def parse_box(text: str, told: str, error: type[Exception]) -> Float32[np.ndarray, "4"]:
@@ -93,6 +97,21 @@ def suppress_overlaps(
         nms_threshold=iou,
     )
     return np.asarray(kept, np.int64).reshape(-1)[:most]
+
+
+def other_places(
+    xyxy: Float32[np.ndarray, "n 4"],
+    order: Int64[np.ndarray, " m"],
+    most: int,
+    kept: Sequence[int] = (),
+) -> Int64[np.ndarray, " k"]:
+    """The boxes `kept`, and those next in `order` that are in other places, up to `most`; sorted."""
+    cover = box_cover(xyxy, xyxy)
+    chosen = list(kept)
+    for i in order.tolist():
+        if len(chosen) < most and cover[i, chosen].max(initial=0.0) <= SAME_PLACE:
+            chosen.append(i)
+    return np.array(sorted(chosen), np.int64)
 
 
 def mask_iou(one: Mask, other: Mask) -> float:

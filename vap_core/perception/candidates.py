@@ -55,6 +55,8 @@ def describe_fault(what: str, part: object, fault: str, role: str = "encoder") -
     )
 
 
+MOST_CANDIDATES = 4
+"""Proposals that are kept as candidates, unless more have votes. Each is segmented."""
 SAME_BOX_IOU = 0.7
 """Boxes of two phrases that overlap by more than this IoU are the same object."""
 
