@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.toys import TOYS, SameColour, overhead, personal, scene
+from tests.toys import TOYS, SameColour, overhead, personal, scene, unchecked
 from vap_core.associate import compare_views
 from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
@@ -599,13 +599,14 @@ def in_millimetres(pose: np.ndarray) -> np.ndarray:
         ({"pose_world": lambda pose: 2.0 * pose}, "has a pose_world without a rotation"),
         ({"pose_world": lambda pose: pose @ np.diag([-1.0, 1, 1, 1])}, "has a pose_world without"),
         ({"k": np.zeros_like}, "has a k that cannot be inverted"),
+        ({"k": lambda k: k[:2]}, "has a k that is not 3 x 3"),
     ],
 )
 def test_a_camera_that_cannot_stand_so_is_refused(change: Any, said: str) -> None:
     """Its rays meet the objects of no other view: every other one would lose its tint."""
     attender = Attender(TOYS, MEMORY, Prompting(associate=True))
     ((field, how),) = change.items()
-    side = replace(CAMERAS["side"], **{field: how(getattr(CAMERAS["side"], field))})
+    side = unchecked(CAMERAS["side"], **{field: how(getattr(CAMERAS["side"], field))})
     with pytest.raises(BadViews, match=f"camera 'side' {said}.*with the table at z = 0"):
         attender.start(CONTRADICTING, "bring my cup", cameras={**CAMERAS, "side": side})
 

@@ -1,6 +1,9 @@
 """The check of signatures that every test runs under refuses what the annotations do not say."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from jaxtyping import Float32
 
 from tests.checked import _checked
 from vap_core.base.errors import device_name
+from vap_core.base.types import EVERY_STEP
 
 Points = Float32[np.ndarray, "n 2"]
 
@@ -60,3 +64,18 @@ def test_a_dataclass_is_checked_when_it_is_built() -> None:
     track = Track(of(2), np.zeros(2, np.float32))
     with pytest.raises(BeartypeCallHintViolation):
         replace(track, seen=np.zeros(3, np.float32))
+
+
+def test_outside_of_tests_all_is_checked_but_what_a_loop_builds_at_every_step() -> None:
+    code = (
+        "import numpy as np\n"
+        "from vap_core.base.types import Boxes, Track\n"
+        "Track('not a mask', 0.5)\n"
+        "Boxes(np.zeros((1, 4)) + [0, 0, 1, 1], np.ones(1, np.float32), 'cup')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "TypeCheckError" in done.stderr
+    assert "called with argument xyxy" in done.stderr or "xyxy" in done.stderr
+    core = "".join(path.read_text() for path in Path("vap_core").rglob("*.py"))
+    for name in EVERY_STEP:
+        assert f"@value\nclass {name}:" in core

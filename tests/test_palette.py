@@ -58,8 +58,6 @@ def test_every_method_and_suite_has_a_marker_of_its_own() -> None:
     assert len(set(marks.values())) == len(many)
     assert len({marker for _, marker in marks.values()}) == len(many)
     assert len({marker for _, marker in pictures.SUITES.values()}) == len(pictures.SUITES)
-    assert pictures.suite_colour("simpler-bridge") == pictures.SUITES["simpler-bridge"][0]
-    assert pictures.suite_colour("my-suite") == pictures.FRAME
 
 
 def test_every_policy_of_a_method_has_a_marker_of_its_own() -> None:

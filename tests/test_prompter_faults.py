@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.toys import TOYS, MeanColour, personal
+from tests.toys import TOYS, MeanColour, personal, unchecked
 from vap_core.attend import Attender
-from vap_core.base.errors import BadCrop, BadEncoder
+from vap_core.base.errors import BadCrop, BadEncoder, BadPart
 from vap_core.base.types import Attended, Boxes, Rgb, Track
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import PromptContext, TintPrompter, checked_steps, unchanged
@@ -50,13 +50,14 @@ class Faulty:
         return self.change(results, states.index(2)) if 2 in states else results
 
 
-def shown_as(change: Callable[[Rgb], Rgb]) -> Change:
+def shown_as(change: Callable[[Rgb], Rgb], **fields: object) -> Change:
     """Its pictures are changed, under the same name."""
 
     def changed(results: list[Result], i: int) -> list[Result]:
         state, attended = results[i]
         images = {name: change(image) for name, image in attended.images.items()}
-        return [*results[:i], (state, replace(attended, images=images)), *results[i + 1 :]]
+        made = unchecked(attended, images=images, **fields)
+        return [*results[:i], (state, made), *results[i + 1 :]]
 
     return changed
 
@@ -121,9 +122,17 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Trial:
         ),
         (
             shown_as(lambda image: image[::2]),
-            r"pictures {'front': \('ndarray', 112, 224, 3\)}; ret",
+            r"pictures {'front': 'ndarray uint8 \(112, 224, 3\)'}; ret",
         ),
-        (shown_as(np.ma.masked_array), r"pictures {'front': \('MaskedArray', 224, 224, 3\)}; ret"),
+        (
+            shown_as(np.ma.masked_array),
+            r"pictures {'front': 'MaskedArray uint8 \(224, 224, 3\)'}; r",
+        ),
+        (
+            shown_as(np.copy, text=None),
+            "tuple as a result; return the state and an Attended with a",
+        ),
+        (shown_as(np.float32), r"pictures {'front': 'ndarray float32 \(224, 224, 3\)'}; return"),
     ],
 )
 def test_a_fault_is_the_error_of_its_episode(trial: Trial, change: Change, message: str) -> None:
@@ -248,6 +257,45 @@ def test_what_a_part_gives_against_its_protocol_is_the_error_of_its_episode(
     statuses = [each.outcome.status for each in (one, bad, other)]
     assert statuses == ["failure", "error", "failure"]
     assert re.search(cause, bad.outcome.detail.strip().splitlines()[-1])
+
+
+class WrongMasks:
+    """Follows as `TOYS` does, and its second step gives masks that are changed."""
+
+    def __init__(self, change: Callable[[np.ndarray], object]) -> None:
+        self.start = TOYS.tracker.start
+        self.change = change
+        self.calls = 0
+
+    def step(self, states: Sequence[Any], images: Sequence[Rgb]) -> object:
+        self.calls += 1
+        after, tracks = TOYS.tracker.step(states, images)
+        if self.calls == 2:
+            wrong = self.change(np.ones(images[0].shape[:2], bool))
+            tracks = [tuple(unchecked(track, mask=wrong) for track in view) for view in tracks]
+        return after, tracks
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (np.uint8, "ndarray uint8 (24, 32)"),
+        (np.transpose, "ndarray bool (32, 24)"),
+        (np.ndarray.tolist, "list  "),
+    ],
+)
+def test_a_mask_that_a_tracker_gives_against_its_protocol_is_refused_with_its_name(
+    change: Callable[[np.ndarray], object], found: str
+) -> None:
+    rgb = np.full((24, 32, 3), (200, 30, 30), np.uint8)
+    box = Boxes(np.array([[4, 4, 16, 16]], np.float32), np.ones(1, np.float32), "cup")
+    stack = TOYS.with_parts("mine", tracker=WrongMasks(change))
+    attender = Attender(stack, {"mug": personal("mug", "cup", (200, 30, 30))})
+    state, _ = attender.start({"front": rgb}, "bring my cup", boxes={"front": box})
+    state, _ = attender.step(state, {"front": rgb})
+    line = f"step: tracker 'WrongMasks' gave {found} as a mask, not ndarray bool (24, 32); test it"
+    with pytest.raises(BadPart, match=re.escape(line)):
+        attender.step(state, {"front": rgb})
 
 
 @pytest.mark.parametrize("score", [np.nan, 7.0, -0.1])

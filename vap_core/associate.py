@@ -303,6 +303,8 @@ def _check_poses(
 def _pose_fault(camera: Camera) -> str:
     """Why a camera cannot stand as its pose says, "" where it can."""
     pose = camera.pose_world
+    if (np.shape(camera.k), np.shape(pose)) != ((3, 3), (4, 4)):
+        return "has a k that is not 3 x 3, or a pose_world that is not 4 x 4"
     if not (np.isfinite(pose).all() and np.isfinite(camera.k).all()):
         return "has numbers that are not finite"
     if np.linalg.matrix_rank(camera.k) < 3:

@@ -51,11 +51,13 @@ from vap_core.perception.candidates import (
     Candidates,
     Proposals,
     embed_views,
+    follow,
+    judge,
     masks_by_id,
     propose,
     segment,
 )
-from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
+from vap_core.perception.protocols import Stack, TargetTracker
 from vap_core.prompt import PALETTE, PromptForm, Tint, choose_colours, has_colour
 from vap_core.vote import VoteRule, check_rule, compare, nominate, vote
 
@@ -98,25 +100,21 @@ class Prompting:
 
     def __post_init__(self) -> None:
         check_rule(self.rule, "Prompting")
-        _check_palette(self.palette)
+        names = [colour.name for colour in self.palette]
+        for colour in self.palette:
+            if not has_colour(np.array([colour.rgb], np.uint8), colour).all():
+                raise BadStudy(
+                    f"Prompting: the palette's {colour.name!r} {colour.rgb} is grey, pale or dark: "
+                    "colours are told apart by their hue; take a vivid one, as in prompt.PALETTE."
+                )
+            if names.count(colour.name) > 1:
+                raise BadStudy(
+                    f"Prompting: the palette has {colour.name!r} twice; give every colour its own "
+                    "name."
+                )
         if self.references is not None and self.references < 1:
             raise BadStudy(
                 f"Prompting: references is {self.references}; give 1 or more, or None for all."
-            )
-
-
-def _check_palette(palette: Sequence[Colour]) -> None:
-    """Raises: BadStudy: a colour that no pixel is found to have, or a name twice."""
-    names = [colour.name for colour in palette]
-    for colour in palette:
-        if not has_colour(np.array([colour.rgb], np.uint8), colour).all():
-            raise BadStudy(
-                f"Prompting: the palette's {colour.name!r} {colour.rgb} is grey, pale or dark: "
-                "colours are told apart by their hue; take a vivid one, as in prompt.PALETTE."
-            )
-        if names.count(colour.name) > 1:
-            raise BadStudy(
-                f"Prompting: the palette has {colour.name!r} twice; give every colour its own name."
             )
 
 
@@ -476,7 +474,7 @@ class Attender:
         trackers = [tracker for state in states for tracker in state.trackers.values()]
         pairs = zip(states, views, strict=True)
         images = [images_now[camera] for state, images_now in pairs for camera in state.trackers]
-        trackers, tracks = self.stack.tracker.step(trackers, images)
+        trackers, tracks = follow(self.stack.tracker, trackers, images)
 
         results = []
         first = 0
@@ -521,20 +519,14 @@ class Attender:
             if given is None:
                 offered = propose(views, phrase, self.stack)
             else:
-                offered = embed_views(views, self._judge(views, phrase, given), self.stack)
+                boxes = {
+                    camera: judge(rgb, given.get(camera, Boxes.empty(phrase)), phrase, self.stack)
+                    for camera, rgb in views.items()
+                }
+                offered = embed_views(views, boxes, self.stack)
             for camera, of_view in offered.items():
                 proposals[camera][phrase] = of_view
         return proposals
-
-    def _judge(self, views: Views, phrase: str, given: Mapping[str, Boxes]) -> dict[str, Boxes]:
-        """Boxes given by hand, with whether their view is familiar."""
-        detector = self.stack.detector
-        boxes = {camera: given.get(camera, Boxes.empty(phrase)) for camera in views}
-        if isinstance(detector, FamiliarityJudge):
-            for camera, rgb in views.items():
-                familiar = detector.is_familiar(rgb, phrase)
-                boxes[camera] = replace(boxes[camera], familiar=familiar)
-        return boxes
 
     @property
     def _marks_others(self) -> bool:

@@ -141,7 +141,7 @@ class BadEncoder(VapError):
 
 
 class BadPart(VapError):
-    """What a detector or segmenter gave for some pictures is not its protocol's."""
+    """What a detector, segmenter or tracker gave for some pictures is not its protocol's."""
 
 
 class BadCrop(BadEncoder):

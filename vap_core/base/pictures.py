@@ -92,12 +92,6 @@ def method_marks(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
     return marks
 
 
-def suite_colour(suite: str) -> str:
-    """The colour of a suite, grey for one that is no benchmark."""
-    colour, _ = SUITES.get(suite, (FRAME, "o"))
-    return colour
-
-
 def object_colours(names: Sequence[str], target: str, goal: str | None = None) -> dict[str, str]:
     """The colour of every object of a scene, by its part in the task."""
     colours = {}

@@ -105,7 +105,7 @@ def other_places(
     most: int,
     kept: Sequence[int] = (),
 ) -> Int64[np.ndarray, " k"]:
-    """The boxes `kept`, and those next in `order` that are in other places, up to `most`; sorted."""
+    """The boxes `kept`, and those next in `order` in other places, up to `most`; in order."""
     cover = box_cover(xyxy, xyxy)
     chosen = list(kept)
     for i in order.tolist():

