@@ -67,3 +67,8 @@ def process(*words: str | Path, cwd: Path | None = None) -> subprocess.Completed
         text=True,
         timeout=500,
     )
+
+
+def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
+    """The engine's jobs, done in this process."""
+    return ((job, work(job)) for job in jobs)

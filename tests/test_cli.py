@@ -105,19 +105,8 @@ def test_ground_answers_in_json_with_a_picture_and_a_recording(
 ) -> None:
     image, boxes = line
     hand = [word for box in boxes for word in ("--box", box)]
-    done = vap(
-        "ground",
-        image,
-        "bring my cup",
-        "--object",
-        "mug",
-        "--memory",
-        bank,
-        "--out",
-        tmp_path,
-        "--json",
-        *hand,
-    )
+    words = ("ground", image, "bring my cup", "--object", "mug", "--memory", bank, "--json")
+    done = vap(*words, "--out", tmp_path, *hand)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["instruction"], sum(answer["votes"])) == (
@@ -178,16 +167,8 @@ def test_ground_says_not_in_view_unless_it_is_to_tint_always(
 
 def test_nothing_found_is_an_answer_and_not_an_error(bank: Path, tmp_path: Path) -> None:
     Image.new("RGB", (224, 224), (120, 130, 140)).save(tmp_path / "empty.png")
-    done = vap(
-        "ground",
-        tmp_path / "empty.png",
-        "bring my cup",
-        "--memory",
-        bank,
-        "--out",
-        tmp_path / "out",
-        "--json",
-    )
+    words = ("ground", tmp_path / "empty.png", "bring my cup", "--memory", bank, "--json")
+    done = vap(*words, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert (answer["winner"], answer["votes"], answer["instruction"]) == (None, [], "bring my cup")

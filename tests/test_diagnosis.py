@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.command import refused, vap
+from tests.command import here, refused, vap
 from tests.test_breakdown import TABLE
 from vap_core.base.errors import BadOutput, BadRecording, BadStudy, UnknownName
 from vap_core.base.files import DATA
@@ -38,10 +38,6 @@ from vap_core.study.trials import Study
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 STUDY = Study((("widowx-pick", "pick-straw-cup"),), ("generic",), episodes=3, policy="random")
-
-
-def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
-    return ((job, work(job)) for job in jobs)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 from tqdm import tqdm
 
-from tests.command import vap
+from tests.command import here, vap
 from vap_core.base.files import DATA
 from vap_core.policies.scripted.expert import Expert
 from vap_core.recording import read_summary
@@ -39,20 +39,9 @@ ENV = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path.cwd())}
 
 
 def command(out: Path, episodes: int, several: bool = False) -> list[str]:
-    asked = [
-        "--suite",
-        "simpler-bridge",
-        *(("--suite", "tabletop") if several else ()),
-        "--methods",
-        "generic",
-        "--policy",
-        "random",
-        "--episodes",
-        str(episodes),
-        "--seeds",
-        "2",
-    ]
-    return [sys.executable, "-m", "vap_core", "eval", *asked, "--workers", "2", "--out", str(out)]
+    asked = f"eval --suite simpler-bridge {'--suite tabletop' if several else ''} --methods generic"
+    more = f"--policy random --episodes {episodes} --seeds 2 --workers 2 --out"
+    return [sys.executable, "-m", "vap_core", *asked.split(), *more.split(), str(out)]
 
 
 def told(out: Path) -> pd.DataFrame:
@@ -355,9 +344,6 @@ def test_an_episode_that_always_breaks_is_an_error_with_its_recording(
     monkeypatch.setattr(trials, "make_policy", lambda name, scene, suite, stack: Breaks())
     study = replace(STUDY, tasks=STUDY.tasks[:1], episodes=2, seeds=1)
 
-    def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
-        return ((job, work(job)) for job in jobs)
-
     table = engine.run(study, tmp_path / "run", record="none", executor=here, progress=False)
     assert table.outcome.tolist()[0] == "error"
     assert table.attempt.tolist() == [2, 1]
@@ -385,9 +371,6 @@ def test_an_error_that_succeeds_when_it_is_tried_again_is_recorded(
     policy = BreaksOnce()
     monkeypatch.setattr(trials, "make_policy", lambda *_: policy)
     study = replace(STUDY, tasks=STUDY.tasks[:1], policy="expert", episodes=1, seeds=1)
-
-    def here(work, jobs, workers, mend):  # type: ignore[no-untyped-def]
-        return ((job, work(job)) for job in jobs)
 
     out = tmp_path / "run"
     table = engine.run(study, out, record=record, executor=here, progress=False)

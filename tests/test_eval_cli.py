@@ -163,21 +163,8 @@ def test_the_table_judged_again_has_the_order_of_the_suite(copied: Path) -> None
 
 @pytest.mark.slow
 def test_a_recording_of_joint_control_through_three_cameras_is_sound(tmp_path: Path) -> None:
-    done = vap(
-        "rollout",
-        "--suite",
-        "vlabench",
-        "--task",
-        "select-cup",
-        "--policy",
-        "expert",
-        "--episodes",
-        "1",
-        "--workers",
-        "1",
-        "--out",
-        tmp_path,
-    )
+    words = "rollout --suite vlabench --task select-cup --policy expert --episodes 1 --workers 1"
+    done = vap(*words.split(), "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     (recording,) = (tmp_path / "recordings").glob("*.rrd")
     verified = subprocess.run(

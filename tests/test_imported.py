@@ -29,17 +29,8 @@ def shelf(tmp_path_factory):
         folder = tmp_path_factory.mktemp("shelf")
         patch.setenv("VAP_OBJECTS", str(folder / "objects"))
         file = put(folder, "mug.glb", mug())
-        done = vap(
-            "objects",
-            "import",
-            file,
-            "--category",
-            "Cup",
-            "--name",
-            "my-mug",
-            "--licence",
-            "CC-BY 4.0, Jane Doe",
-        )
+        words = ("objects", "import", file, "--category", "Cup", "--name", "my-mug")
+        done = vap(*words, "--licence", "CC-BY 4.0, Jane Doe")
         assert done.returncode == 0, done.stderr
         assert "convex parts" in done.stderr
         assert "too wide for the gripper of wx250s" in done.stderr

@@ -147,16 +147,8 @@ def told(c: Any) -> tuple[object, ...]:
 
 def test_a_pair_of_methods_is_counted_by_hand() -> None:
     (c,) = compared(episodes(WON))
-    assert (c.one, c.other, c.pairs, c.layouts, c.both, c.only_one, c.only_other, c.neither) == (
-        "generic",
-        "vap",
-        10,
-        10,
-        2,
-        1,
-        6,
-        1,
-    )
+    assert (c.one, c.other, c.pairs, c.layouts) == ("generic", "vap", 10, 10)
+    assert (c.both, c.only_one, c.only_other, c.neither) == (2, 1, 6, 1)
     assert c.difference == pytest.approx(0.5)
     assert c.p == c.p_mcnemar == c.p_holm == mcnemar(1, 6)
     assert c.low < 0.5 < c.high

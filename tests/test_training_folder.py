@@ -377,6 +377,11 @@ def test_a_training_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Pat
         train_steps(nn.Linear(2, 1), losses, run(6), tmp_path)
 
 
+def of_looks(folder: Path, rate: float, epochs: int = 1) -> Run:
+    about = {"name": "looks", "seed": 0, "decay": 0.0, "file": folder / "looks.pt"}
+    return Run(**about, rate=rate, epochs=epochs, resume=True, expired=lambda: False)
+
+
 @pytest.mark.parametrize("fault", ["loss", "gradient"])
 def test_a_head_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -> None:
     epochs = []
@@ -389,16 +394,7 @@ def test_a_head_that_diverges_is_said_and_not_kept(fault: str, tmp_path: Path) -
         yield loss
 
     head = nn.Linear(2, 1)
-    run = Run(
-        name="looks",
-        seed=0,
-        epochs=3,
-        rate=0.1,
-        decay=0.0,
-        file=tmp_path / "looks.pt",
-        resume=True,
-        expired=lambda: False,
-    )
+    run = of_looks(tmp_path, 0.1, epochs=3)
     told = {"loss": "loss is not finite at batch 1 of", "gradient": "weights are not finite after"}
     message = f"looks head's {told[fault]} epoch 2; run it again with another --seed"
     with pytest.raises(BadOutput, match=message):
@@ -412,26 +408,14 @@ def test_a_head_that_was_trained_otherwise_is_not_taken(tmp_path: Path) -> None:
     def losses(rng: np.random.Generator) -> Iterator[Tensor]:
         yield head(torch.ones(1, 2)).sum()
 
-    def run(rate: float) -> Run:
-        return Run(
-            name="looks",
-            seed=0,
-            epochs=1,
-            rate=rate,
-            decay=0.0,
-            file=tmp_path / "looks.pt",
-            resume=True,
-            expired=lambda: False,
-        )
-
     head = nn.Linear(2, 1)
-    fit(head, losses, 1, run(0.1))
-    fit(head, losses, 1, run(0.1))
+    fit(head, losses, 1, of_looks(tmp_path, 0.1))
+    fit(head, losses, 1, of_looks(tmp_path, 0.1))
     with pytest.raises(BadOutput, match=r"looks\.pt is of a looks head that was trained otherwise"):
-        fit(head, losses, 1, run(0.2))
+        fit(head, losses, 1, of_looks(tmp_path, 0.2))
     head = nn.Linear(2, 2)
     with pytest.raises(BadOutput, match="trained otherwise"):
-        fit(head, losses, 1, run(0.1))
+        fit(head, losses, 1, of_looks(tmp_path, 0.1))
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
