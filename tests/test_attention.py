@@ -407,8 +407,9 @@ def test_the_real_command_records_it(tmp_path: Path) -> None:
 
 
 def test_who_cannot_tell_is_refused_in_one_line(tmp_path: Path) -> None:
-    words = "rollout --suite widowx-pick --task pick-bottle --episodes 1 --attention all --out"
-    done = vap(*words.split(), tmp_path / "run")
+    words = "rollout --suite widowx-pick --task pick-bottle --episodes 1 --attention all".split()
+    words += ["--out", str(tmp_path / "run")]
+    done = vap(*words)
     assert done.returncode == 2
     assert "gives no attention maps" in done.stderr
     assert "Traceback" not in done.stderr
