@@ -14,7 +14,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -108,7 +108,8 @@ class Server:
         pid = int(self.process.stdout.readline())
         ended, _, _ = select.select([self.process.stdout], [], [], after_s)
         if not ended:
-            os.kill(pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it may end just now
+                os.kill(pid, signal.SIGKILL)
         status = os.waitstatus_to_exitcode(int(self.process.stdout.readline()))
         assert status in (0, -signal.SIGKILL), f"{name} ends with {status}"
         return status != 0
