@@ -11,9 +11,12 @@ from vap_core.study.workers import prepare
 from vap_core.study.workers import results
 
 prepare(("json",))
-asked = "(lambda gc: (gc.isenabled(), gc.get_freeze_count() > 1000))(__import__('gc'))"
-(answer,) = results(eval, [asked], 1, "--workers")
-print(answer[1])
+asked = [
+    "(lambda gc: (gc.isenabled(), gc.get_freeze_count() > 1000))(__import__('gc'))",
+    "__import__('importlib.util').util.find_spec('sklearn') is not None",
+    "__import__('importlib.metadata').metadata.packages_distributions()['PIL']",
+]
+print([answer for _, answer in sorted(results(eval, asked, 1, "--workers"))])
 """
 STARTS = """
 import sys
@@ -42,9 +45,9 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
 
 
-def test_a_worker_collects_garbage_but_not_among_imports() -> None:
+def test_a_worker_collects_garbage_but_not_among_imports_and_can_import_what_was_hidden() -> None:
     done = run(COLLECTS)
-    assert done.stdout.strip() == "(True, True)", done.stderr[-500:]
+    assert done.stdout.strip() == "[(True, True), ['pillow'], True]", done.stderr[-500:]
 
 
 @pytest.mark.parametrize(
