@@ -1,6 +1,7 @@
 """The whole method on a world whose every answer is known."""
 
 import inspect
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -260,7 +261,8 @@ def test_a_box_that_is_wider_for_the_second_object_is_the_same_object() -> None:
     assert attended.text == "put the red cup near my vase"
     first = where(LINE, TEAL) & (np.arange(64) < 34)
     assert (attended.images["front"] == tint(LINE, first, RED)).all()
-    assert attended.tracks["front"][0] is attended.tracks["front"][1]
+    one, other = attended.tracks["front"]
+    assert one.mask is other.mask
     _, attended = attender.step(state, {"front": LINE})
     assert (attended.images["front"] == tint(LINE, where(LINE, TEAL), RED)).all()
 
@@ -376,12 +378,18 @@ def test_a_view_keeps_its_size() -> None:
         ({}, "no views; give the picture of every camera, by its name"),
         (LINE, "no views"),
         ({"front": None}, "view 'front' is NoneType; give RGB, height x width x 3, uint8"),
-        ({"front": LINE.astype(np.float32)}, "view 'front' is float32 64x64x3; give RGB"),
-        ({"front": LINE.transpose(2, 0, 1)}, "view 'front' is uint8 3x64x64; give RGB"),
-        ({"front": np.dstack([LINE, LINE[..., :1]])}, "view 'front' is uint8 64x64x4; give RGB"),
-        ({"front": LINE[..., 0]}, "view 'front' is uint8 64x64; give RGB"),
-        ({"front": LINE[None]}, "view 'front' is uint8 1x64x64x3; give RGB"),
-        ({"front": LINE[:0]}, "view 'front' is uint8 0x64x3; give RGB"),
+        (
+            {"front": LINE.astype(np.float32)},
+            "view 'front' is ndarray float32 (64, 64, 3); give RGB",
+        ),
+        ({"front": LINE.transpose(2, 0, 1)}, "view 'front' is ndarray uint8 (3, 64, 64); give RGB"),
+        (
+            {"front": np.dstack([LINE, LINE[..., :1]])},
+            "view 'front' is ndarray uint8 (64, 64, 4); give RGB",
+        ),
+        ({"front": LINE[..., 0]}, "view 'front' is ndarray uint8 (64, 64); give RGB"),
+        ({"front": LINE[None]}, "view 'front' is ndarray uint8 (1, 64, 64, 3); give RGB"),
+        ({"front": LINE[:0]}, "view 'front' is ndarray uint8 (0, 64, 3); give RGB"),
         ({"front": LINE, "wrist": LINE.tolist()}, "view 'wrist' is list; give RGB"),
     ],
 )
@@ -390,9 +398,9 @@ def test_a_view_that_is_no_rgb_picture_is_refused_at_every_step(views: Any, said
     attender = Attender(TOYS, MEMORY)
     state, _ = attender.start({"front": LINE}, "bring my cup")
     start, steps = inspect.unwrap(Attender.start), inspect.unwrap(Attender.steps)
-    with pytest.raises(BadViews, match=said):
+    with pytest.raises(BadViews, match=re.escape(said)):
         start(attender, views, "bring my cup")
-    with pytest.raises(BadViews, match=said):
+    with pytest.raises(BadViews, match=re.escape(said)):
         steps(attender, [state], [views])
 
 

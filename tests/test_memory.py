@@ -101,7 +101,10 @@ def test_register_says_what_is_missing(name: str, category: str, photos: int, er
     [
         ([[np.nan, 0.0]], "numbers that are not finite"),
         ([[3.0, 4.0]], "a row of length 5, not of length 1"),
-        ([[1.0, 0.0], [1.0, 0.0]], "2 rows for 1 crops"),
+        (
+            [[1.0, 0.0], [1.0, 0.0]],
+            r"ndarray float32 \(2, 2\), not ndarray float32 \(1 crops, width\)",
+        ),
     ],
 )
 def test_bad_rows_are_not_remembered(rows: list[list[float]], fault: str) -> None:

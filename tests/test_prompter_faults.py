@@ -223,7 +223,7 @@ def boxed(xyxy: Sequence[float], score: float) -> Callable[..., object]:
         (
             "segmenter",
             lambda *_: None,
-            "'Second' gave NoneType  , not ndarray bool .1, 448, 448.; t",
+            "'Second' gave NoneType, not ndarray bool .1, 448, 448.; t",
         ),
         (
             "segmenter",
@@ -281,7 +281,7 @@ class WrongMasks:
     [
         (np.uint8, "ndarray uint8 (24, 32)"),
         (np.transpose, "ndarray bool (32, 24)"),
-        (np.ndarray.tolist, "list  "),
+        (np.ndarray.tolist, "list"),
     ],
 )
 def test_a_mask_that_a_tracker_gives_against_its_protocol_is_refused_with_its_name(

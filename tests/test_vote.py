@@ -199,18 +199,18 @@ def attending(encoder: Encoder) -> None:
     [
         (
             lambda rows: rows.astype(np.float64),
-            r"an array of shape \(\d, 3\) and type float64, not",
+            r"ndarray float64 \(\d, 3\), not ndarray float32 \(\d crops, width\)",
         ),
         (
             lambda rows: rows.astype(np.float16),
-            r"an array of shape \(\d, 3\) and type float16, not",
+            r"ndarray float16 \(\d, 3\), not",
         ),
-        (lambda rows: rows.tolist(), "list, not a NumPy array"),
-        (lambda rows: memoryview(rows), "memoryview, not a NumPy array"),
-        (np.ma.masked_array, "MaskedArray, not a NumPy array"),
-        (lambda rows: None, "NoneType, not a NumPy array"),
-        (lambda rows: rows.ravel(), r"an array of shape \(\d,\) and type float32, not"),
-        (lambda rows: rows[:-1], r"\d rows for \d crops"),
+        (lambda rows: rows.tolist(), "list, not ndarray"),
+        (lambda rows: memoryview(rows), r"memoryview  \(\d, 3\), not ndarray"),
+        (np.ma.masked_array, r"MaskedArray float32 \(\d, 3\), not"),
+        (lambda rows: None, "NoneType, not ndarray"),
+        (lambda rows: rows.ravel(), r"ndarray float32 \(\d+,\), not"),
+        (lambda rows: rows[:-1], r"ndarray float32 \(\d, 3\), not ndarray float32 \(\d crops"),
         (lambda rows: 0 * rows, "a row of length 0, not of length 1"),
     ],
 )

@@ -42,6 +42,7 @@ from vap_core.base.types import (
     Track,
     Views,
     election_scores,
+    kind_of,
     value,
 )
 from vap_core.instruction import Parser, rewrite, unite
@@ -142,14 +143,16 @@ def check_views(views: Any) -> None:
     if not isinstance(views, Mapping) or not views:
         raise BadViews("Attender: no views; give the picture of every camera, by its name.")
     for camera, rgb in views.items():
-        is_array = isinstance(rgb, np.ndarray)
-        if is_array and rgb.dtype == np.uint8 and rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.size:
+        if (
+            isinstance(rgb, np.ndarray)
+            and rgb.dtype == np.uint8
+            and rgb.ndim == 3
+            and rgb.shape[2] == 3
+            and rgb.size
+        ):
             continue
-        kind = rgb.dtype if is_array else type(rgb).__name__
-        sides = "x".join(map(str, getattr(rgb, "shape", ())))
         raise BadViews(
-            f"Attender: view {camera!r} is {f'{kind} {sides}'.strip()}; give RGB, height x width x "
-            "3, uint8."
+            f"Attender: view {camera!r} is {kind_of(rgb)}; give RGB, height x width x 3, uint8."
         )
 
 
@@ -619,36 +622,26 @@ def _other_masks(followed: Sequence[Mask | None], ids: Sequence[int | None]) -> 
 
 def _first_tracks(per_target: PerTarget, ids: Sequence[int | None]) -> tuple[Track, ...]:
     """The tracks of a view at t = 0: the masks of the chosen candidates, one per identity."""
-    tracks: list[Track] = []
-    for grounding, identity in zip(per_target, ids, strict=True):
-        j = ids.index(identity)
-        if identity is not None and j < len(tracks):
-            tracks.append(tracks[j])
-        else:
-            tracks.append(Track(grounding.mask, 0.0 if grounding.mask is None else 1.0))
-    return tuple(tracks)
+    firsts = [
+        per_target[j if identity is None else ids.index(identity)] for j, identity in enumerate(ids)
+    ]
+    return tuple(Track(first.mask, float(first.mask is not None)) for first in firsts)
 
 
 def _tracks_of_targets(
     state: AttendState, by_camera: Mapping[str, Sequence[Track]]
 ) -> dict[str, tuple[Track, ...]]:
     """From one track per identity to one per target, in every view."""
-    tracks: dict[str, tuple[Track, ...]] = {}
-    for camera, ids in state.ids.items():
-        per_target = []
-        for identity in ids:
-            if identity is None:
-                per_target.append(Track(None, 0.0))
-            else:
-                per_target.append(by_camera[camera][identity])
-        tracks[camera] = tuple(per_target)
-    return tracks
+    return {
+        camera: tuple(Track(None, 0.0) if i is None else by_camera[camera][i] for i in ids)
+        for camera, ids in state.ids.items()
+    }
 
 
 def _visible(tracks: Mapping[str, tuple[Track, ...]]) -> Visible:
-    pairs = set()
-    for camera, per_target in tracks.items():
-        for j, track in enumerate(per_target):
-            if track.mask is not None:
-                pairs.add((camera, j))
-    return frozenset(pairs)
+    return frozenset(
+        (camera, j)
+        for camera, per_target in tracks.items()
+        for j, track in enumerate(per_target)
+        if track.mask is not None
+    )

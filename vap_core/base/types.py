@@ -41,7 +41,8 @@ def value[T](cls: type[T]) -> type[T]:
 
 def kind_of(found: object) -> str:
     """What a part gave in place of an array: its type, and its numbers' type and shape."""
-    return f"{type(found).__name__} {getattr(found, 'dtype', '')} {getattr(found, 'shape', '')}"
+    about = f"{type(found).__name__} {getattr(found, 'dtype', '')} {getattr(found, 'shape', '')}"
+    return about.strip()
 
 
 @value

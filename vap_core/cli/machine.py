@@ -60,18 +60,14 @@ def doctor() -> None:
 
     Example: python -m vap_core doctor
     """
-    findings = examine()
-    print(*findings, sep="\n")
-    if any(finding.needed and not finding.works for finding in findings):
-        raise typer.Exit(1)
-
-
-def examine() -> list[Finding]:
-    """Look at everything; nothing here raises."""
+    # Look at everything; nothing here raises.
     needed = (_python, _gl, _weights, _lists, _rerun)
     others = (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie)
     checks = [_run_check(check, needed=check in needed) for check in (*needed, *others)]
-    return [*checks, _viewer(), *_foundation(), _not_in_view()]
+    findings = [*checks, _viewer(), *_foundation(), _not_in_view()]
+    print(*findings, sep="\n")
+    if any(finding.needed and not finding.works for finding in findings):
+        raise typer.Exit(1)
 
 
 def _run_check(check: Callable[[], tuple[str, str]], needed: bool) -> Finding:

@@ -40,12 +40,6 @@ def check_fits(attended: Attended, observation: Observation) -> None:
     checked_steps([(None, attended)], "", [observation])
 
 
-def check_same(one: Attended, other: Attended) -> None:
-    assert one.text == other.text
-    for name, image in one.images.items():
-        assert np.array_equal(image, other.images[name])
-
-
 def copies(images: Views) -> Views:
     return {name: image.copy() for name, image in images.items()}
 
@@ -88,4 +82,6 @@ def test_a_batch_equals_one_by_one(prompter: Prompter[Any], where: str) -> None:
     for expected, (_, found) in zip(
         alone, prompter.steps(states, observations, contexts), strict=True
     ):
-        check_same(found, expected)
+        assert found.text == expected.text
+        for name, image in found.images.items():
+            assert np.array_equal(image, expected.images[name])

@@ -95,9 +95,10 @@ def test_sanity_a_still_scene_keeps_its_masks(tracker: Tracker, scene: RenderedS
     states = tracker.start([scene.rgb], [scene.masks])
     for _ in range(3):
         states, (tracks,) = tracker.step(states, [scene.rgb])
-    kept = []
-    for track, mask in zip(tracks, scene.masks, strict=True):
-        kept.append(0.0 if track.mask is None else mask_iou(track.mask, mask))
+    kept = [
+        0.0 if track.mask is None else mask_iou(track.mask, mask)
+        for track, mask in zip(tracks, scene.masks, strict=True)
+    ]
     assert np.mean(kept) >= 0.7
 
 
@@ -110,7 +111,8 @@ def test_sanity_what_is_gone_has_no_mask_and_what_is_back_has_one(
     assert all(track.mask is None for track in gone)
     for _ in range(2):
         states, (back,) = tracker.step(states, [scene.rgb])
-    right = []
-    for track, mask in zip(back, scene.masks, strict=True):
-        right.append(track.mask is not None and mask_iou(track.mask, mask) > 0.5)
+    right = [
+        track.mask is not None and mask_iou(track.mask, mask) > 0.5
+        for track, mask in zip(back, scene.masks, strict=True)
+    ]
     assert np.mean(right) >= 0.6

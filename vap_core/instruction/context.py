@@ -211,8 +211,7 @@ def add_uses(bank: Path, objects: Sequence[str], by: str, at: datetime) -> None:
         bank.mkdir(parents=True, exist_ok=True)
         with folder_locked(bank):
             lines = _lines(path) if path.exists() else []
-            whole = [*lines, *added][-MAX_USES:]
-            write_atomic(path, b"".join(line + b"\n" for line in whole))
+            write_atomic(path, b"".join(line + b"\n" for line in [*lines, *added][-MAX_USES:]))
 
 
 def _lines(path: Path) -> list[bytes]:

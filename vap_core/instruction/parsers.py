@@ -46,8 +46,7 @@ def load_parser(name: str, context: Context, *, fall_back: bool = False) -> Pars
     if name == "chat" or "://" in name:
         from vap_core.perception.chat import endpoint_from_environment
 
-        endpoint = endpoint_from_environment("" if name == "chat" else name)
-        parser = ChatParser(context, endpoint)
+        parser = ChatParser(context, endpoint_from_environment("" if name == "chat" else name))
         if fall_back:
             return FallBack(parser, rule_parser(context.objects), partial(print, file=sys.stderr))
         return parser

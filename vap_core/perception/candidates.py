@@ -32,16 +32,11 @@ def embed_crops(what: str, encoder: Encoder, crops: Sequence[Rgb]) -> Float32[np
         begins with `what`.
     """
     rows = encoder(crops)
-    fault = ""
-    if type(rows) is not np.ndarray:
-        fault = f"{type(rows).__name__}, not a NumPy array"
-    elif rows.ndim != 2 or rows.dtype != np.float32:
-        fault = f"an array of shape {rows.shape} and type {rows.dtype}, not float32 (crops, width)"
-    elif len(rows) != len(crops):
-        fault = f"{len(rows)} rows for {len(crops)} crops"
-    if fault:
-        raise BadEncoder(describe_fault(what, encoder, fault))
-    return rows
+    kind = kind_of(rows)
+    if kind.startswith("ndarray float32 (") and rows.ndim == 2 and len(rows) == len(crops):
+        return rows
+    fault = f"{kind}, not ndarray float32 ({len(crops)} crops, width)"
+    raise BadEncoder(describe_fault(what, encoder, fault))
 
 
 def row_fault(rows: Float32[np.ndarray, "n _d"], references: Float32[np.ndarray, "k _e"]) -> str:

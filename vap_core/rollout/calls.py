@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vap_core.base.errors import BadPlan, BadPolicy, BadStudy, TimeIsUp, interrupting, one_of
+from vap_core.base.types import kind_of
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.protocol import (
     ACTION,
@@ -118,22 +119,15 @@ def checked_plan(returned: object, label: str, n: int) -> tuple[list[Any], list[
     return list(returned[0]), list(returned[1])
 
 
-def check_chunks(chunks: Sequence[object], label: str, action_names: Sequence[str]) -> None:
+def check_chunks(chunks: Sequence[Any], label: str, action_names: Sequence[str]) -> None:
     """Raises: BadPlan when a chunk is no float32 array with `action_names` in every row."""
     size = len(action_names)
     for chunk in chunks:
-        found = type(chunk).__name__
-        if isinstance(chunk, np.ndarray):
-            if (
-                type(chunk) is np.ndarray
-                and chunk.shape[1:] == (size,)
-                and len(chunk)
-                and chunk.dtype == np.float32
-            ):
-                continue
-            found += f": an array of shape {chunk.shape} and type {chunk.dtype}"
+        kind = kind_of(chunk)
+        if kind.startswith("ndarray float32 (") and chunk.shape[1:] == (size,) and len(chunk):
+            continue
         raise BadPlan(
-            f"{label}: plan returned {found} as a chunk; return a NumPy array of type float32 and "
+            f"{label}: plan returned {kind} as a chunk; return a NumPy array of type float32 and "
             f"shape (steps, {size}), in every row {', '.join(action_names)}."
         )
 

@@ -219,12 +219,12 @@ class ArrowPrompter:
         contexts: Sequence[PromptContext],
     ) -> list[tuple[AttendState, Attended]]:
         followed = self.follower.steps(states, observations, contexts)
-        results = []
-        for (state, attended), observation, context in zip(
-            followed, observations, contexts, strict=True
-        ):
-            results.append((state, self._draw(attended, observation, context)))
-        return results
+        return [
+            (state, self._draw(attended, observation, context))
+            for (state, attended), observation, context in zip(
+                followed, observations, contexts, strict=True
+            )
+        ]
 
     def _draw(
         self, attended: Attended, observation: Observation, context: PromptContext

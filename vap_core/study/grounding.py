@@ -304,9 +304,10 @@ def grounding_figure(
     rgb: Rgb, attended: Attended, objects: Sequence[PersonalObject], camera: str
 ) -> "Figure":
     """One row per target: the candidates, the policy's image, and the picture of the vote."""
-    votes = []
-    for grounding, obj in zip(attended.groundings[camera], objects, strict=True):
-        votes.append(vote_picture(grounding, rgb, obj.crops, cell_px=VOTE_CELL_PX, dark=False))
+    votes = [
+        vote_picture(grounding, rgb, obj.crops, cell_px=VOTE_CELL_PX, dark=False)
+        for grounding, obj in zip(attended.groundings[camera], objects, strict=True)
+    ]
     aspects = [vote.shape[1] / vote.shape[0] for vote in votes]
     figure = empty_figure(7.8 + 3.9 * max(aspects), 3.9 * len(objects))
     rows = figure.subfigures(len(objects), 1, squeeze=False)[:, 0]

@@ -155,7 +155,7 @@ def main_results() -> "pd.DataFrame":
     import pandas as pd
 
     keys = ["suite", "split", "task", "method", "paper_method"]
-    methods = _our_methods()
+    methods = {row.format(policy): method for method, row in METHODS.items() for policy in POLICIES}
     facts = ledger()
     facts = facts[facts["table"].isin([FRACTAL, BRIDGE, VLABENCH])]
     lines = []
@@ -199,12 +199,3 @@ def real_arm() -> str:
 def footnotes(suite: str) -> list[str]:
     """What to print under a table that shows the paper's numbers of a suite."""
     return [note.text for note in FOOTNOTES if note.suite == suite]
-
-
-def _our_methods() -> dict[str, str]:
-    """Our method for each row of the paper's main tables."""
-    methods = {}
-    for method, row in METHODS.items():
-        for policy in POLICIES:
-            methods[row.format(policy)] = method
-    return methods

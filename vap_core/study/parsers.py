@@ -65,8 +65,7 @@ class Paraphrase:
 @cache
 def read_vocabulary() -> dict[str, Any]:
     """The suites' objects, what they are for and look like, and other things."""
-    vocabulary = json.loads((FOLDER / "objects.json").read_text("utf-8"))
-    return vocabulary
+    return json.loads((FOLDER / "objects.json").read_text("utf-8"))
 
 
 def suite_names() -> tuple[str, ...]:

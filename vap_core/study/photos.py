@@ -159,7 +159,8 @@ def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], .
     }
     objects = {}
     for path in folders:
-        check_object_folder(path)
+        if not NAME.fullmatch(path.name):
+            raise _wrong(f"{path} cannot name an object; call it by {NAME_RULE}.")
         photos = photos_in(path)
         if not photos:
             raise _wrong(
@@ -173,12 +174,6 @@ def _read_references(folder: Path) -> dict[str, tuple[tuple[Path, Box | None], .
             f"{table} names {sorted(boxes)[0]!r}, which is not there; name photos as OBJECT/FILE."
         )
     return objects
-
-
-def check_object_folder(path: Path) -> None:
-    """Raises: BadPhotoSet: the object of a folder of photos cannot be called as the folder is."""
-    if not NAME.fullmatch(path.name):
-        raise _wrong(f"{path} cannot name an object; call it by {NAME_RULE}.")
 
 
 def _read_scenes(folder: Path, known: Mapping[str, Any]) -> tuple[Scene, ...]:
@@ -364,8 +359,7 @@ def _ground(
     The box that the vote elected is there whether it is tinted or not; None without candidates.
     """
     started, cpu_started = perf_counter(), process_time()
-    instruction = f"bring my {obj.category}"
-    _, attended = attender.start({CAMERA: rgb}, instruction, objects=[obj.name])
+    _, attended = attender.start({CAMERA: rgb}, f"bring my {obj.category}", objects=[obj.name])
     ms, cpu_ms = 1000 * (perf_counter() - started), 1000 * (process_time() - cpu_started)
     (grounding,) = attended.groundings[CAMERA]
     candidates, chosen = grounding.candidates, grounding.chosen
@@ -482,8 +476,7 @@ def single_rows(memory: Mapping[str, PersonalObject], stack: Stack) -> list[Row]
         pairs = list(combinations(others, 2))
         for _ in range(TRIALS):
             references = list(chosen[int(rng.integers(len(chosen)))])
-            left_out = np.setdiff1d(np.arange(len(own)), references)
-            candidates = [own[int(rng.choice(left_out))]]
+            candidates = [own[int(rng.choice(np.setdiff1d(np.arange(len(own)), references)))]]
             candidates.extend(
                 rows_of[rival][int(rng.integers(len(rows_of[rival])))]
                 for rival in pairs[int(rng.integers(len(pairs)))]
@@ -538,8 +531,7 @@ def frames_of(rgb: Rgb, pan: Pan) -> Iterator[Rgb]:
     doubled = np.concatenate([rgb, rgb], axis=1)
     size = (round(pan.scale * pan.width), round(pan.scale * rgb.shape[0]))
     for left in pan.left.astype(int).tolist():
-        part = doubled[:, left : left + pan.width]
-        yield cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+        yield cv2.resize(doubled[:, left : left + pan.width], size, interpolation=cv2.INTER_AREA)
 
 
 def follow_scene(scene: Scene, photo_set: PhotoSet, stack: Stack) -> list[Row]:
@@ -584,8 +576,7 @@ def _start(
     here = pan.boxes(0, pan.with_twins(known))
     kept = [i for i, box in enumerate(here) if i == 0 or visible_share(box, frame) >= IN_VIEW]
     height, width = frame.shape[:2]
-    xyxy = np.clip(here[kept], 0, (width, height, width, height)).astype(np.float32)
-    boxes = _true_boxes(xyxy)
+    boxes = _true_boxes(np.clip(here[kept], 0, (width, height, width, height)).astype(np.float32))
     masks = stack.segmenter(frame, judge(frame, boxes, boxes.phrase, stack))
     tracker = stack.tracker
     if isinstance(tracker, TargetTracker):
@@ -637,7 +628,6 @@ def text_report(table: "pd.DataFrame") -> str:
 def _judged(table: "pd.DataFrame") -> "pd.DataFrame":
     """With what became of every question."""
     right, silent = table.iou >= RIGHT_IOU, ~table.tinted.astype(bool)
-    elected = table.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU
     return table.assign(
         **{
             "proposed": table.proposed_iou >= RIGHT_IOU,
@@ -645,7 +635,7 @@ def _judged(table: "pd.DataFrame") -> "pd.DataFrame":
             "right at IoU .25": table.iou >= LOOSE_IOU,
             "wrong tinted": ~silent & ~right,
             "silent": silent,
-            "not in view": silent.where(elected),
+            "not in view": silent.where(table.chosen_iou.astype(float).fillna(0) >= RIGHT_IOU),
         }
     )
 

@@ -420,14 +420,13 @@ def leave_one_out(
         winners.append(vote(cosine).winner or 0)
         mean = cosine.mean(axis=1)
         margins.append(float(mean[0] - mean[1:].max()))
-    beaten_by = {names[winner - 1] for winner in winners if winner}
     return Trust(
         right=winners.count(0),
         n=n,
         margin=min(margins, default=float("nan")),
         others=len(rivals) - len(background),
         background=len(background),
-        by_name=tuple(sorted(beaten_by - {""})),
+        by_name=tuple(sorted({names[winner - 1] for winner in winners if winner} - {""})),
     )
 
 

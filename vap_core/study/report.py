@@ -183,8 +183,7 @@ def comparison_table(compared: "pd.DataFrame") -> "pd.DataFrame":
         "-" if line.low != line.low else points_text(line, digits=1)
         for line in compared.itertuples()
     ]
-    names = {"p_mcnemar": "p McNemar", "p": "p layouts", "p_holm": "p Holm"}
-    for column, name in names.items():
+    for column, name in {"p_mcnemar": "p McNemar", "p": "p layouts", "p_holm": "p Holm"}.items():
         table[name] = compared[column].map(lambda p: "< 0.001" if p < 0.001 else f"{p:.3f}")
     return table[["suite", *table.columns.drop("suite")]]
 
@@ -593,8 +592,7 @@ def results_table(scores: "pd.DataFrame") -> str:
     table = scores[["suite"]].assign(task=scores["task"] + split)
     table[["method", "policy", "n", "errors"]] = scores[["method", "policy", "n", "errors"]]
     for name, title in (("sr", "SR"), ("cmr", "CMR"), ("wrong_object", "wrong object")):
-        rates = [rate_of(line, name) for line in scores.to_dict("records")]
-        table[f"{title} % [95 %]"] = rates
+        table[f"{title} % [95 %]"] = [rate_of(line, name) for line in scores.to_dict("records")]
     return printed(table)
 
 

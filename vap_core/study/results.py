@@ -588,8 +588,7 @@ def errors(runs: Runs, limit: int = 5) -> list[str]:
     counts = last_lines.replace("", "(no traceback was kept)").value_counts(sort=True)
     lines = [f"{n} x {text}" for text, n in counts.head(limit).items()]
     if len(counts) > limit:
-        rest = counts.iloc[limit:].sum()
-        lines.append(f"and {rest} of {len(counts) - limit} other kinds")
+        lines.append(f"and {counts.iloc[limit:].sum()} of {len(counts) - limit} other kinds")
     return lines
 
 

@@ -259,10 +259,9 @@ def step_times(episodes: "Iterable[Mapping[str, Any]] | pd.DataFrame") -> dict[s
     if table.empty:
         return {}
     steps = max(int(table["steps"].sum()), 1)
-    parts = [name for name in map(str, table.columns) if name.startswith("seconds_")]
     return {
         name.removeprefix("seconds_"): 1e3 * float(table[name].astype(float).sum()) / steps
-        for name in parts
+        for name in [name for name in map(str, table.columns) if name.startswith("seconds_")]
         if table[name].notna().any()
     }
 

@@ -307,15 +307,13 @@ def measures_text(found: "pd.DataFrame") -> "pd.DataFrame":
 
 def report(tables: "dict[str, pd.DataFrame]", stack: str) -> str:
     """What the command prints."""
-    views = tables["views"]
     left_out = ", ".join(
         f"{name} {int((~part.counts).sum())} of {len(part)}"
-        for name, part in views.groupby("suite", sort=False)
+        for name, part in tables["views"].groupby("suite", sort=False)
     )
-    references = tables["references"]
     cut = share(
         hit
-        for row in references.itertuples()
+        for row in tables["references"].itertuples()
         for hit in [False] * row.whole + [True] * (row.k - row.whole)
     )
     note = (

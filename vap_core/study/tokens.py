@@ -137,10 +137,9 @@ class Tokens(Measurement):
 
         Raises: BadStudy when nothing is asked for.
         """
-        usual = [k for k in self.ks if k == USUAL_K]
         jobs = [
             Job(suite, task.name, k, place, self.epochs)
-            for ks in (usual, [k for k in self.ks if k != USUAL_K])
+            for ks in ([k for k in self.ks if k == USUAL_K], [k for k in self.ks if k != USUAL_K])
             for suite in self.suites
             for task in suites.suite(suite).tasks
             for k in ks

@@ -264,8 +264,7 @@ def _check_policy(study: Study) -> None:
         require("policy", f"the policy {policy}")
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
-            names = sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))
-            there = ", ".join(names) or "none"
+            there = ", ".join(sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))) or "none"
             raise BadStudy(
                 f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
                 f"train policy --suite {suites.benchmark_name(suite)}"
