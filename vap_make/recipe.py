@@ -13,11 +13,20 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from vap_core.base.errors import one_of
+from vap_core.base.types import Colour
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
 from vap_core.simulation.suites.benchmarks import BRIDGE, FILMED_AREA, FRACTAL
 from vap_core.simulation.suites.layout import Area
 from vap_make.lists import benchmarks
+
+TINTS = (
+    Colour("orange", (255, 128, 0)),
+    Colour("purple", (128, 0, 255)),
+    Colour("pink", (255, 128, 192)),
+    Colour("cyan", (0, 160, 176)),
+)
+"""Tints of the policies that are taught any: no colour of the palette."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +44,11 @@ class Sizes:
 class Recipe(Sizes):
     """How long, how large, and in which language.
 
-    Language: a command calls its target by a colour, `plain` and `described` are the shares of
-    those that do not; where they do not fit a frame, the colour is used. `taught` objects have a
-    learned word, which `learned` of their commands use. A scene is tinted with the odds
-    `tint_share`, whatever the command; any object that may be meant carries the tint, or none, with
-    equal odds. `held_out_tints` are no tints of training, nor are opacities outside `opacities`.
+    Language: a command calls its target by the colour of its materials; `plain` and `described` are
+    the shares of those that do not. `held_out_words` are in no command and on no object. `taught`
+    objects have a learned word, which `learned` of their commands use. A scene is tinted with the
+    odds `tint_share`, whatever the command: any object that may be meant carries the tint, or none,
+    with equal odds; the tints are TINTS, of an `opacity` in that range.
 
     The policy begins with nothing, or goes on from `start`: a shipped one's name, or a folder.
 
@@ -63,11 +72,11 @@ class Recipe(Sizes):
     seed: int = 0
     focus: float = 3.0
     angle_noise_rad: float = 0.02
-    tint_share: float = 0.2
-    held_out_tints: tuple[str, ...] = ("magenta", "yellow")
-    opacities: tuple[tuple[float, float], ...] = ((0.25, 0.42), (0.58, 0.75))
-    plain: float = 0.25
-    described: float = 0.4
+    tint_share: float = 0.0
+    opacity: tuple[float, float] = (0.3, 0.7)
+    held_out_words: tuple[str, ...] = ("magenta", "yellow")
+    plain: float = 0.2
+    described: float = 0.25
     taught: int = 80
     learned: float = 0.5
     start: str = ""

@@ -1,16 +1,15 @@
 """The words of the small models: of instructions, questions and answers, and of appearance."""
 
 import re
-from collections.abc import Iterable
 from functools import cache
 
-from vap_core.base.types import Colour
 from vap_core.perception import describe
 from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import CATEGORIES, CLUTTER
 from vap_core.simulation.assets.shapes import Texture
 from vap_core.simulation.suites import BENCHMARKS
+from vap_make.colours import WORDS as COLOUR_WORDS
 
 DETERMINERS = ("my", "the", "a")
 FIRST = ("<pad>", "<unk>", "\n")
@@ -31,26 +30,6 @@ PATTERNS = {
     "gradient": "shaded",
 }
 """Words for motifs of generic objects; every other one is "patterned"."""
-PAINTS = (
-    *PALETTE,
-    Colour("orange", (255, 140, 0)),
-    Colour("purple", (130, 30, 170)),
-    Colour("pink", (255, 150, 180)),
-    Colour("teal", (0, 128, 128)),
-    Colour("brown", (120, 72, 32)),
-    Colour("white", (250, 250, 250)),
-    Colour("black", (15, 15, 15)),
-)
-"""Colours that something may have by nature; a tint has one of the palette's."""
-NEAR = {
-    "red": {"pink", "orange", "brown"},
-    "blue": {"teal", "purple", "cyan"},
-    "green": {"teal", "cyan", "yellow"},
-    "magenta": {"pink", "purple"},
-    "cyan": {"teal", "blue", "green"},
-    "yellow": {"orange", "beige", "green"},
-}
-"""Colours that a tint or a paint may be confused with."""
 
 
 def vocabulary() -> tuple[str, ...]:
@@ -63,8 +42,7 @@ def vocabulary() -> tuple[str, ...]:
     for benchmark in BENCHMARKS.values():
         for task in benchmark.tasks:
             texts.append(task.instruction)
-    for colour in PALETTE:
-        texts.append(colour.name)
+    texts += [*(colour.name for colour in PALETTE), *COLOUR_WORDS]
     words = []
     for text in (*texts, *CATEGORIES, *CLUTTER):
         words += re.findall(r"[\w']+", text.lower())
@@ -83,20 +61,3 @@ def pattern_words(name: str) -> frozenset[str]:
     if not isinstance(texture, Texture):
         return frozenset()
     return frozenset({PATTERNS.get(texture.motif, "patterned")})
-
-
-@cache
-def similar_colours(word: str) -> frozenset[str]:
-    """The word, and colours that it may be taken for."""
-    similar = {word} | NEAR.get(word, set())
-    for colour, near in NEAR.items():
-        if word in near:
-            similar.add(colour)
-    return frozenset(similar)
-
-
-def distinct_colours(taken: Iterable[str]) -> list[Colour]:
-    """The palette's colours that nobody takes for one of these words; all when none is left."""
-    words = set(taken)
-    distinct = [colour for colour in PALETTE if not similar_colours(colour.name) & words]
-    return distinct or list(PALETTE)

@@ -11,6 +11,7 @@ import io
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ from vap_core.base.types import Mask, Rgb, value
 from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.rollout.running import expert_steps
 from vap_core.simulation.assets import objects
+from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.simulation.env import Env
 from vap_core.simulation.scenes import Scene, build
 from vap_core.simulation.suites import Suite, Task, suite
@@ -35,7 +37,7 @@ from vap_make.films.looks import draw_look
 from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
 from vap_make.folder import kept_arrays
 from vap_make.lists import benchmarks
-from vap_make.objects import generic_instance
+from vap_make.objects import dye_some, generic_instance
 from vap_make.recipe import FILMED, RECIPES, every, filmed_tasks
 
 SIDE = 112
@@ -100,12 +102,26 @@ def draw_objects(
     """The target and its rivals, distractors of other categories if any, and the task's goal; of a
     pair those of `pairs`.
 
-    Target and rivals are generic and of the task's category; half the rivals are look-alikes. Those
-    `held_out` are in no film.
+    Target and rivals are generic and of the task's category; half the rivals are look-alikes, and
+    most scenes have dyed objects. Those `held_out` are in no film.
     """
+    avoid = RECIPES[known.name].held_out_words
+    draw = pairs.draw_models if FILMED[known.name].pairs else partial(draw_models, known)
+    while True:
+        try:
+            models = dye_some(draw(task, rng, held_out), rng, avoid)
+        except ValueError:
+            continue
+        only_generic(models)
+        names = [model.name for model in models]
+        return [*names, task.goal] if task.goal and not FILMED[known.name].pairs else names
+
+
+def draw_models(
+    known: Suite, task: Task, rng: np.random.Generator, held_out: bool
+) -> list[ObjectModel]:
+    """The target, its rivals and distractors, none of them dyed."""
     filmed = FILMED[known.name]
-    if filmed.pairs:
-        return pairs.draw_objects(task, rng, held_out)
     pool = range(TRAIN_INSTANCES)
     if held_out:
         pool = range(HELD_OUT, HELD_OUT + TRAIN_INSTANCES)
@@ -130,11 +146,7 @@ def draw_objects(
     for kind in seen[:distractors]:
         index = pool[int(rng.integers(len(pool)))]
         models.append(generic_instance(str(kind), index))
-    only_generic(models)
-    names = [model.name for model in models]
-    if task.goal:
-        names.append(task.goal)
-    return names
+    return models
 
 
 def row(

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.simulation.suites import Suite, Task
 from vap_core.simulation.suites.layout import place_at_random_yaws
 from vap_core.simulation.types import EpisodeRow
-from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES, only_generic
+from vap_make.films.scenes import HELD_OUT, TRAIN_INSTANCES
 from vap_make.lists import shared
 from vap_make.objects import generic_instance
 
@@ -21,13 +22,13 @@ TRIES = 2000
 """How many layouts are drawn before there is no room."""
 
 
-def draw_objects(task: Task, rng: np.random.Generator, held_out: bool = False) -> list[str]:
-    """Names of EACH objects of the target's category, then of EACH of the goal's.
+def draw_models(task: Task, rng: np.random.Generator, held_out: bool) -> list[ObjectModel]:
+    """EACH objects of the target's category, then EACH of the goal's.
 
     Half of them are look-alikes of each other. Those `held_out` are in no film.
     """
     first = HELD_OUT if held_out else 0
-    models = []
+    models: list[ObjectModel] = []
     for stem in (task.stem, task.goal.removesuffix("-personal")):
         instances = first + rng.choice(TRAIN_INSTANCES, EACH, replace=False)
         if rng.random() < 0.5:
@@ -36,8 +37,7 @@ def draw_objects(task: Task, rng: np.random.Generator, held_out: bool = False) -
         else:
             for i in instances:
                 models.append(generic_instance(stem, int(i)))
-    only_generic(models)
-    return [model.name for model in models]
+    return models
 
 
 def row(

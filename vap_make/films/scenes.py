@@ -23,7 +23,7 @@ from vap_core.simulation.assets.objects import ObjectModel
 from vap_core.simulation.looks import DEFAULT_STYLE, Colour3, SceneStyle
 from vap_core.simulation.studio import Shot, Stage
 from vap_make.folder import kept_arrays
-from vap_make.objects import generic_instance
+from vap_make.objects import dye_some, generic_instance
 
 import mujoco  # isort: skip  (scenes has chosen a GL back end)
 
@@ -88,10 +88,13 @@ def only_generic(models: Sequence[ObjectModel]) -> None:
         )
 
 
-def draw_objects(rng: Generator, held_out: bool) -> tuple[list[ObjectModel], int]:
+def draw_objects(
+    rng: Generator, held_out: bool, dyes: bool = False
+) -> tuple[list[ObjectModel], int]:
     """A crew of two to four look-alikes, then bystanders, and the number of the crew.
 
-    Bystanders are of one to three other kinds, mostly one of each.
+    Bystanders are of one to three other kinds, mostly one of each. With `dyes`, most scenes have
+    dyed objects.
     """
     leader = str(rng.choice(objects.CATEGORIES if rng.random() < 0.9 else objects.CLUTTER))
     kinds = rng.permutation(np.array(objects.CATEGORIES + objects.CLUTTER))
@@ -108,6 +111,8 @@ def draw_objects(rng: Generator, held_out: bool) -> tuple[list[ObjectModel], int
         for i in rng.choice(TRAIN_INSTANCES, size=count, replace=False):
             bystander = _draw_stem(rng, kind)
             models.append(generic_instance(bystander, first + int(i)))
+    if dyes:
+        models = dye_some(models, rng)
     only_generic(models)
     return models, crew
 
@@ -139,10 +144,11 @@ def stage(
     held_out: bool = False,
     views: int = VIEWS,
     look: Look = draw_style,
+    dyes: bool = False,
 ) -> Shots:
-    """Render one stage, in a room that `look` draws."""
+    """Render one stage, in a room that `look` draws; with `dyes`, of dyed objects too."""
     rng = np.random.default_rng([seed, number, int(held_out)])
-    models, crew = draw_objects(rng, held_out)
+    models, crew = draw_objects(rng, held_out, dyes)
     robot = sorted(robots.ROBOTS)[int(rng.integers(len(robots.ROBOTS)))]
     with (
         scenes.build(robot, models, style=look(rng)) as scene,
@@ -222,7 +228,13 @@ def scatter(
 
 
 def cached(
-    folder: Path, seed: int, number: int, *, held_out: bool = False, look: Look = draw_style
+    folder: Path,
+    seed: int,
+    number: int,
+    *,
+    held_out: bool = False,
+    look: Look = draw_style,
+    dyes: bool = False,
 ) -> Shots:
     """The stage from `folder`, rendered first if it is not there.
 
@@ -231,7 +243,7 @@ def cached(
     path = stage_file(folder, seed, number, held_out)
     if not path.exists():
         started = time.process_time()
-        shots = stage(seed, number, held_out=held_out, look=look)
+        shots = stage(seed, number, held_out=held_out, look=look, dyes=dyes)
         arrays: dict[str, Any] = {"cpu_s": np.array(time.process_time() - started)}
         for name in PARTS:
             arrays[name] = getattr(shots, name)

@@ -6,7 +6,9 @@ those, and bake what ships with `python -m vap_make.objects`. Importing this pac
 generic instance to what `get_object` finds.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping, Sequence
+from colorsys import hsv_to_rgb
 from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any, get_type_hints
@@ -25,7 +27,8 @@ from vap_core.simulation.assets.objects import (
     Baked,
     ObjectModel,
 )
-from vap_core.simulation.assets.shapes import Mesh, Solid, Texture
+from vap_core.simulation.assets.shapes import Mesh, Solid, Srgb, Texture
+from vap_make.colours import seen
 from vap_make.objects.families import FAMILIES, Family
 from vap_make.objects.generics import draw_texture, draw_twin
 from vap_make.objects.shapes import Shape
@@ -33,6 +36,25 @@ from vap_make.objects.textures import render_atlas
 
 FAMILY_NUMBERS: dict[str, int] = {family.stem: i for i, family in enumerate(FAMILIES)}
 """Seeds depend on these numbers."""
+WHOLE, SOAKED = 0.75, (0.35, 0.9)
+"""Share of dyed objects that are dyed all around, and how much dye their materials take."""
+UNDYED, ONE_DYED, MOST_DYED = 0.2, 0.4, 0.75
+"""Shares of scenes in which nothing is dyed, and one object; and how many objects of the others."""
+DYES = 10_000
+"""Dyes have numbers below this one."""
+
+
+@value
+class Dye:
+    """A colour that an object's materials are dyed with, from their left edge on.
+
+    `share` of it is mixed into their own colours, so that a motif stays, in shades of one hue;
+    `around` is the part of the decoration that is dyed.
+    """
+
+    rgb: Srgb
+    share: float
+    around: float = 1.0
 
 
 @value
@@ -41,6 +63,7 @@ class Drawn:
 
     body: Shape
     texture: Texture
+    dye: Dye | None = None
 
     def mesh(self) -> Mesh:
         return self.body.mesh()
@@ -49,7 +72,13 @@ class Drawn:
         return self.body.solids()
 
     def picture(self) -> Rgb:
-        return render_atlas(self.texture, self.body.aspect())
+        picture = render_atlas(self.texture, self.body.aspect())
+        if self.dye is None:
+            return picture
+        dyed = picture.astype(np.float32)
+        part = dyed[:, : round(self.dye.around * picture.shape[1])]
+        part += self.dye.share * (np.array(self.dye.rgb, np.float32) - part)
+        return np.rint(dyed).astype(np.uint8)
 
 
 def _spelled(body: Shape) -> dict[str, Any]:
@@ -89,13 +118,22 @@ FIXED: dict[str, ObjectModel] = {name: _drawn(model) for name, model in OBJECTS.
 """Personal instances, look-alikes and props: their parameters are the catalogue's rows."""
 
 
+def draw_dye(rng: np.random.Generator) -> Dye:
+    """Any hue, more or less vivid; now and then only half an object is dyed."""
+    vivid, bright = rng.uniform((0.65, 0.4), 1.0)
+    red, green, blue = (round(255 * c) for c in hsv_to_rgb(rng.random(), vivid, bright))
+    around = 1.0 if rng.random() < WHOLE else float(rng.uniform(0.4, 0.7))
+    return Dye((red, green, blue), float(rng.uniform(*SOAKED)), around)
+
+
 @lru_cache(maxsize=4096)
-def generic_instance(kind: str, index: int, twin: int = 0) -> ObjectModel:
+def generic_instance(kind: str, index: int, twin: int = 0, dye: int = 0) -> ObjectModel:
     """Training instance number `index` (0 or more) of a kind: the same call, the same object.
 
     `twin` 1 or more is a look-alike of it, so that telling instances apart can be trained without
     an evaluation object: it is decorated anew, in its colours (as often with one colour changed,
-    now and then with all), and half the time of its very shape.
+    now and then with all), and half the time of its very shape. `dye` 1 or more is the number of a
+    colour that it is dyed with.
     """
     family = family_of(kind)
     number = FAMILY_NUMBERS[family.stem]
@@ -110,8 +148,57 @@ def generic_instance(kind: str, index: int, twin: int = 0) -> ObjectModel:
         twin_rng = np.random.default_rng([21, number, index, twin])
         body, texture = draw_twin(family, body, texture, twin_rng)
         name = f"{name}-{twin}"
-    shape, form = _spelled(body), Drawn(body, texture)
+    colour = None
+    if dye:
+        colour = draw_dye(np.random.default_rng([22, number, index, twin, dye]))
+        name = f"{family.stem}-generic-{index:04d}-{twin}-{dye}"
+    shape, form = _spelled(body), Drawn(body, texture, colour)
     return ObjectModel(name, family.category, "generic", shape, texture, mass_kg, form)
+
+
+def dyed(model: ObjectModel, dye: int) -> ObjectModel:
+    """A generic instance with a dye of this number."""
+    stem, _, numbers = model.name.rpartition("-generic-")
+    index, twin = (*map(int, numbers.split("-")), 0)[:2]
+    return generic_instance(stem, index, twin, dye)
+
+
+def dye_some(
+    models: Sequence[ObjectModel], rng: np.random.Generator, avoid: Collection[str] = ()
+) -> list[ObjectModel]:
+    """The objects, none of them dyed, one, or most, each in a colour of its own.
+
+    Raises: ValueError where one that is not dyed has a colour to avoid.
+    """
+    drawn, chances = rng.random(), rng.random(len(models))
+    if drawn < UNDYED:
+        chances[:] = 1.0
+    elif drawn < UNDYED + ONE_DYED:
+        chances = np.where(chances == chances.min(), 0.0, 1.0)
+    chosen = []
+    for model, chance in zip(models, chances, strict=True):
+        while chance < MOST_DYED:
+            coloured = dyed(model, int(rng.integers(1, DYES)))
+            if not _shows(coloured, avoid):
+                break
+        chosen.append(coloured if chance < MOST_DYED else model)
+    if any(_shows(model, avoid) for model in chosen):
+        raise ValueError("dye_some: an object has a colour to avoid; draw others")
+    return chosen
+
+
+def _shows(model: ObjectModel, words: Collection[str]) -> bool:
+    """Whether the object's own materials have one of the colours."""
+    return not material_colours(model.name)[1].isdisjoint(words)
+
+
+@lru_cache(maxsize=8192)
+def material_colours(name: str) -> tuple[str, frozenset[str]]:
+    """The colours of a drawn object's materials in white light, as `colours.seen` tells them."""
+    model = draw(name)
+    assert model is not None
+    picture = model.form.picture()[::4, ::4]
+    return seen([picture], [np.ones(picture.shape[:2], bool)])
 
 
 def draw(name: str) -> ObjectModel | None:
@@ -119,9 +206,8 @@ def draw(name: str) -> ObjectModel | None:
     plain = name.removesuffix(RED)
     model = FIXED.get(plain)
     stem, _, numbers = plain.rpartition("-generic-")
-    index, _, twin = numbers.partition("-")
-    if stem in FAMILY_NUMBERS and index.isdecimal() and (twin or "0").isdecimal():
-        model = generic_instance(stem, int(index), int(twin or 0))
+    if stem in FAMILY_NUMBERS and re.fullmatch(r"\d+(-\d+){0,2}", numbers, re.ASCII):
+        model = generic_instance(stem, *map(int, numbers.split("-")))
     if model is None or model.name != plain:
         return None
     if plain == name:

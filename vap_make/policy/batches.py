@@ -18,7 +18,7 @@ from vap_core.policies.scripted.expert import TURN_RAD_S
 from vap_core.simulation.suites import suite
 from vap_make.films.demonstrations import Film
 from vap_make.patches import patch_shares
-from vap_make.policy.commands import Command, Known, command
+from vap_make.policy.commands import Command, Known, Seen, colours_of, command
 from vap_make.recipe import Recipe, every
 
 AROUND = 4
@@ -73,7 +73,8 @@ class Batch:
 class Frames:
     """The frames of some films of one suite, to draw batches from.
 
-    Every task is drawn as often, and in it a frame as often as `emphasis` says.
+    Every task is drawn as often, and in it a frame as often as `emphasis` says, where a command
+    fits it. Films that show a held-out word's colour are left out.
 
     Raises: UnknownName for a recipe of a suite that no registry holds.
     """
@@ -87,7 +88,15 @@ class Frames:
         known: Known,
     ) -> None:
         self.recipe = recipe
-        self.films = films
+        held_out = set(recipe.held_out_words)
+        self.films: list[Film] = []
+        self.colours: list[list[Seen]] = []
+        for film in films:
+            colours = colours_of(film)
+            if all(held_out.isdisjoint(shown) for _, shown in colours):
+                self.films.append(film)
+                self.colours.append(colours)
+        films = self.films
         self.stats = stats
         self.config = config
         self.known = known
@@ -109,8 +118,10 @@ class Frames:
         patches = []
         places = []
         turns = []
-        for i in rng.choice(len(self.films), n, p=self.share):
-            sample = self._draw_sample(int(i), rng)
+        while len(commands) < n:
+            sample = self._draw_sample(int(rng.choice(len(self.films), p=self.share)), rng)
+            if sample is None:
+                continue
             commands.append(sample.command)
             states.append(sample.state)
             chunks.append(sample.chunk)
@@ -132,13 +143,15 @@ class Frames:
             learned=_stack_learned(commands, self.config.width),
         )
 
-    def _draw_sample(self, i: int, rng: np.random.Generator) -> "_Sample":
-        """A frame of film i, drawn anew."""
+    def _draw_sample(self, i: int, rng: np.random.Generator) -> "_Sample | None":
+        """A frame of film i, drawn anew; None where no command of the drawn form fits it."""
         film = self.films[i]
         chances = self.chances[i]
         picture = int(rng.choice(len(chances), p=chances / self.totals[i]))
         t = picture * self.interval
-        drawn = command(film, t, self.recipe, self.known, rng)
+        drawn = command(film, t, self.recipe, self.known, self.colours[i], rng)
+        if drawn is None:
+            return None
         state = film.state[t]
         chunk = target_chunk(film, t, self.config.chunk_size)
         closing = (np.nan, np.nan)

@@ -1,13 +1,14 @@
-"""Commands for filmed frames, and the colours that fit them: one demonstration teaches many.
+"""Commands for filmed frames: one demonstration teaches many.
 
-*Coloured*: the target is called by its colour, which is its own, paint, or a tint. *Described*: as
-a hard prompt does it, in the captioner's words. *Learned*: by a learned word, as a soft prompt does
-it. *Plain*: the command does not say which object is meant; only frames in which the hand is nearer
-to the target than to any rival, so that a plain command means what the hand already nears.
-A pair's command is plain, or names both its objects by their colours.
+*Coloured*: the target is called by its colour, which is that of its materials (`colours.seen` of
+the pictures), or a tint's where the recipe has any. *Described*: as a hard prompt does it, in the
+captioner's words. *Learned*: by a learned word, as a soft prompt does it. *Plain*: the command does
+not say which object is meant; only frames in which the hand is nearer to the target than to any
+rival, so that a plain command means what the hand already nears. A pair's command is plain, or
+names both its objects by their colours.
 
-The form is drawn from what the frame allows, and then the colours (`colouring`): under every form
-an object is as often tinted or painted whether it is the target or not.
+The form is drawn before it is asked whether it fits, and a frame that it does not fit is left out:
+what an object looks like says nothing about whether a plain or described command means it.
 """
 
 import re
@@ -18,21 +19,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core.base.types import Description, value
+from vap_core.base.types import Colour, Description, value
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.rollout.prompters import soft_prompt
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
+from vap_make.colours import seen, stands_out
 from vap_make.films.captions import distinguishes
 from vap_make.films.demonstrations import Film
-from vap_make.policy.colouring import (
-    Colouring,
-    Images,
-    colour_of,
-    colour_views,
-    draw_colouring,
-)
+from vap_make.policy.tints import Images, draw_tints, tint_views
 from vap_make.recipe import FILMED, Recipe, every, filmed_task
 from vap_make.words import DETERMINERS
 
@@ -42,6 +38,8 @@ NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 Form = Literal["coloured", "described", "learned", "plain"]
 Embedding = Float32[np.ndarray, " d"]
+Seen = tuple[str, frozenset[str]]
+"""What an object is called by its colour, and the colours that it shows, as `colours.seen`."""
 
 
 @dataclass(frozen=True)
@@ -60,20 +58,35 @@ class Command:
     """One training sample: views and words, and how the two name the target.
 
     `things` are the numbers of the film's target, which comes first, of its rivals, and last of a
-    pair's goal; the colouring counts them. `embedding` is that of the learned word in `text`, if
-    there is one.
+    pair's goal; `tints` counts them. `embedding` is that of the learned word in `text`, if there is
+    one.
     """
 
     images: Images
     text: str
     form: Form
     things: tuple[int, ...]
-    colouring: Colouring
+    tints: Mapping[int, Colour]
     embedding: Embedding | None = None
 
 
-def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Generator) -> Command:
+def colours_of(film: Film) -> list[Seen]:
+    """The colours of every object of a film, seen in its first pictures."""
+    views = list(film.images[0])
+    return [seen(views, list(film.ids[0] == i + 1)) for i in range(len(film.names))]
+
+
+def command(
+    film: Film,
+    t: int,
+    recipe: Recipe,
+    known: Known,
+    colours: Sequence[Seen],
+    rng: np.random.Generator,
+) -> Command | None:
     """Step t of a film, which has a picture, with a command that its action answers.
+
+    `colours` are `colours_of` the film. None where the form that was drawn does not fit the frame.
 
     Raises: UnknownName for a film of a task that the recipe's suite does not film.
     """
@@ -81,60 +94,42 @@ def command(film: Film, t: int, recipe: Recipe, known: Known, rng: np.random.Gen
     pairs = FILMED[recipe.suite].pairs
     things = nameable(film, recipe.suite)
     names = [film.names[i] for i in things]
-    looks = [known.captions[name] for name in names]
+    caption = known.captions[names[0]]
     length: Literal["short", "long"] = "long" if rng.random() < 0.5 else "short"
-    fits: dict[Form, bool] = {
-        "coloured": True,
-        "described": not pairs and distinguishes(known.captions, names, length),
-        "learned": names[0] in known.learned,
-        "plain": near(film, t, recipe.suite, things[1:]),
-    }
-    form = _draw_form(recipe, fits, rng)
-    colouring = draw_colouring(
-        looks,
-        recipe,
-        rng,
-        may_paint=form in ("coloured", "plain"),
-        distinct=form == "coloured",
-        at_once=2 if pairs else 1,
-    )
-    if colouring is None:
-        # No colours distinguish these objects: as rare as it is, a description has to do.
-        form = "described"
-        colouring = Colouring(tinted={}, painted={})
+    words, shown = map(list, zip(*(colours[i] for i in things), strict=True))
+    tints = draw_tints(shown, recipe, rng, at_once=2 if pairs else 1)
+    for i, colour in tints.items():
+        words[i] = colour.name
+        shown[i] |= {colour.name}
+    form = _draw_form(recipe, names[0] in known.learned, rng)
     embedding = None
-    if form == "coloured" and pairs:
-        text = phrase_pair(
-            task, colour_of(0, looks, colouring), colour_of(len(things) - 1, looks, colouring)
-        )
-    elif form == "coloured":
-        text = phrase_instruction(task, colour_of(0, looks, colouring), rng)
+    if form == "coloured":
+        named = (0, len(things) - 1) if pairs else (0,)
+        for i in named:
+            if not stands_out(words[i], shown[:i] + shown[i + 1 :]):
+                return None
+        text = phrase_instruction(task, words[0], rng)
+        if pairs:
+            text = phrase_pair(task, words[0], words[-1])
     elif form == "described":
-        text = describe_instruction(task, getattr(looks[0], length))
+        if pairs or not distinguishes(known.captions, names, length):
+            return None
+        text = describe_instruction(task, getattr(caption, length))
     elif form == "learned":
         text = soft_prompt(WORD, [task.category]).rewrite(task.instruction)
         embedding = known.learned[names[0]]
     else:
+        if not near(film, t, recipe.suite, things[1:]):
+            return None
         text = phrase_instruction(task, "", rng)
     picture = t // every(recipe.suite)
-    images = colour_views(
-        images=film.images[picture],
-        ids=film.ids[picture],
-        things=things,
-        colouring=colouring,
-        recipe=recipe,
-        rng=rng,
-    )
+    images = film.images[picture]
+    if tints:
+        owned = {things[i]: colour for i, colour in tints.items()}
+        images = tint_views(images, film.ids[picture], owned, recipe, rng)
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
     lit = np.clip(images * gain, 0, 255).astype(np.uint8)
-    return Command(
-        images=lit,
-        text=text,
-        form=form,
-        things=tuple(things),
-        colouring=colouring,
-        embedding=embedding,
-    )
+    return Command(lit, text, form, tuple(things), tints, embedding)
 
 
 def nameable(film: Film, suite_name: str) -> list[int]:
@@ -185,14 +180,11 @@ def describe_instruction(task: Task, phrase: str) -> str:
     return f"{task.instruction}. My {task.category} is {phrase}."
 
 
-def _draw_form(recipe: Recipe, fits: Mapping[Form, bool], rng: np.random.Generator) -> Form:
-    """A form that fits, by the recipe's shares; what does not fit is coloured."""
-    if fits["learned"] and rng.random() < recipe.learned:
+def _draw_form(recipe: Recipe, has_word: bool, rng: np.random.Generator) -> Form:
+    """A form, by the recipe's shares."""
+    if has_word and rng.random() < recipe.learned:
         return "learned"
     drawn = rng.random()
-    form: Form = "coloured"
     if drawn < recipe.described:
-        form = "described"
-    elif drawn < recipe.described + recipe.plain:
-        form = "plain"
-    return form if fits[form] else "coloured"
+        return "described"
+    return "plain" if drawn < recipe.described + recipe.plain else "coloured"

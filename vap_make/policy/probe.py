@@ -1,9 +1,9 @@
 """Closed-loop episodes of a trained policy with generic objects that no film has shown.
 
 They show what it can do before any user's object is involved. Four ways to say which object is
-meant: a tint from the simulator's masks and the colour's word (VAP at its best), paint (it has the
-colour by nature), a description of its own look, or nothing. When nothing is said, any of its kind
-is right, and what counts is whether the hand commits.
+meant: a tint from the simulator's masks and the colour's word (VAP at its best); the word of the
+colour that its materials are dyed with; a description of its own look; or nothing. When nothing is
+said, any of its kind is right, and what counts is whether the hand commits.
 """
 
 import re
@@ -22,7 +22,7 @@ from vap_core.base.files import make_folder, read_parquet, write_atomic
 from vap_core.base.types import Attended, Colour, Description, Rgb, value
 from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.policies.names import label_of
-from vap_core.prompt import ALPHA, PALETTE
+from vap_core.prompt import ALPHA, PALETTE, tint
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
@@ -33,24 +33,24 @@ from vap_core.study.stats import rate
 from vap_core.study.table import printed
 from vap_core.study.trials import shipped
 from vap_core.study.workers import results
+from vap_make.colours import HUES_DEG, stands_out
 from vap_make.films.captions import describe, distinguishes
-from vap_make.films.demonstrations import draw_objects, row
-from vap_make.policy.colouring import natural_colours, painted, tinted
+from vap_make.films.demonstrations import draw_models, row
+from vap_make.objects import DYES, dyed, material_colours
 from vap_make.policy.commands import describe_instruction, phrase_instruction
-from vap_make.recipe import FILMED
-from vap_make.words import distinct_colours
+from vap_make.recipe import FILMED, RECIPES
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WAYS = ("tinted", "painted", "described", "plain")
+WAYS = ("tinted", "coloured", "described", "plain")
+DRAWS = 1000
+"""Dyes that are tried for one that stands out."""
 EACH = 4
 """Episodes of one scene, each run in every way."""
 ASKED = ["suite", "policy", "method"]
 """What tells the episodes of a kept table apart, whose place others take."""
 OTHER_TABLE = "name another table with --out"
-COAT = 0.85
-"""Opacity of paint."""
 ProbeState = tuple[Colour, str]
 """The colour and the instruction of one episode."""
 
@@ -65,7 +65,7 @@ class Tinting:
 
 
 class ProbePrompter:
-    """Colours the target by ground-truth masks at every step, and says which object is meant.
+    """Says which object is meant; "tinted" tints it by ground-truth masks at every step.
 
     Raises: UnknownName, as `parse_way`.
     """
@@ -85,20 +85,15 @@ class ProbePrompter:
         row = context.truth.row
         rng = np.random.default_rng([79, row.seed, row.episode])
         described = _described(tuple(_same_kind(row)))
-        target, *rivals = described.values()
-        taken: set[str] = set()
-        for look in rivals:
-            taken.update(natural_colours(look))
-        usable = distinct_colours(taken)
-        colour = usable[int(rng.integers(len(usable)))]
-        if self.tinting.colour is not None:
-            colour = self.tinting.colour
+        colour = self.tinting.colour or _draw_tint(row, rng)
         length = _length(described, rng)  # Drawn in every way, so that all ways draw alike.
         task = suite(row.suite).task(row.task)
         if self.way == "plain":
             text = context.instruction.replace("my ", "the ", 1)
         elif self.way == "described":
-            text = describe_instruction(task, getattr(target, length))
+            text = describe_instruction(task, getattr(described[row.target], length))
+        elif self.way == "coloured":
+            text = phrase_instruction(task, material_colours(row.target)[0], rng)
         else:
             text = phrase_instruction(task, colour.name, rng)
         state = (colour, text)
@@ -123,12 +118,8 @@ class ProbePrompter:
         images = dict(observation.images)
         for camera, rgb in observation.images.items():
             mask = context.truth.masks[camera].get(context.truth.row.target)
-            if mask is None:
-                continue
-            if self.way == "tinted":
-                (images[camera],) = tinted(rgb[None], mask[None], colour, alpha=self.tinting.alpha)
-            elif self.way == "painted":
-                (images[camera],) = painted(rgb[None], mask[None], colour, coat=COAT)
+            if mask is not None and self.way == "tinted":
+                images[camera] = tint(rgb, mask, colour, self.tinting.alpha)
         return unchanged(images, text)
 
 
@@ -281,10 +272,13 @@ def _scene(
     known = suite(suite_name)
     rng = np.random.default_rng([78, seed, *suite_name.encode(), number])
     task = known.tasks[number % len(known.tasks)]
-    names = draw_objects(known, task, rng, held_out=True)
+    names = [model.name for model in draw_models(known, task, rng, held_out=True)]
+    if task.goal:
+        names.append(task.goal)
     rows = _rows(known=known, task=task, names=names, number=number, rng=rng)
+    coloured = [_with_dyed_target(row) for row in rows]
     lines = []
-    with build_scene(suite_name, names) as scene:
+    with build_scene(suite_name, [*names, *{row.target: 0 for row in coloured}]) as scene:
         policy = lerobot.load_for_suite(checkpoint, scene, known)
         if execute is not None:
             policy = policy.with_execute(execute)
@@ -292,6 +286,8 @@ def _scene(
             played = rows
             if way == "described":
                 played = [row for row in rows if _can_describe(row)]
+            elif way == "coloured":
+                played = coloured
             trial = Trial(
                 method=way,
                 scene=scene,
@@ -304,6 +300,32 @@ def _scene(
             for episode in rollout(trial, played, batch=EACH):
                 lines.append({**episode.summary(), "scene": number})
     return lines
+
+
+def _rivals_show(row: EpisodeRow) -> list[frozenset[str]]:
+    """The colours of the materials of the target's rivals."""
+    return [material_colours(name)[1] for name in _same_kind(row)[1:]]
+
+
+def _draw_tint(row: EpisodeRow, rng: np.random.Generator) -> Colour:
+    """A colour of the palette that no rival shows; any where there is none."""
+    rivals = _rivals_show(row)
+    usable = [colour for colour in PALETTE if stands_out(colour.name, rivals)] or list(PALETTE)
+    return usable[int(rng.integers(len(usable)))]
+
+
+def _with_dyed_target(row: EpisodeRow) -> EpisodeRow:
+    """The episode with its target dyed in a colour that no rival shows."""
+    rng = np.random.default_rng([77, row.seed, row.episode])
+    rivals, target = _rivals_show(row), get_object(row.target)
+    for _ in range(DRAWS):
+        name = dyed(target, int(rng.integers(1, DYES))).name
+        word, _ = material_colours(name)
+        usual = word in HUES_DEG and word not in RECIPES[row.suite].held_out_words
+        if usual and stands_out(word, rivals):
+            break
+    first, *others = row.placements
+    return replace(row, placements=(replace(first, model=name), *others))
 
 
 @cache

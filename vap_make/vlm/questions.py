@@ -5,9 +5,9 @@ A mini-PaliGemma learns to answer them before any policy grows from it.
 *Where is the red cup*: top left. *Is there a red cup in this image*, *can you recognize the striped
 cup in this image*: yes or no, equally often; the hard no's name a colour that no cup has. *What
 colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*:
-no words; only the patches that show it are asked for. Colours are paint, or an object's own, and
-never a tint; an object is named by its colour or pattern where that distinguishes it from others of
-its kind, and by its kind where it is the only one.
+no words; only the patches that show it are asked for. Colours are those of an object's materials,
+as the view's pixels show them; an object is named by its colour or pattern where that distinguishes
+it from others of its kind, and by its kind where it is the only one.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -17,20 +17,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.base.types import Description, value
-from vap_core.prompt import PALETTE
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS
-from vap_make.policy.colouring import COAT, natural_colours, painted
-from vap_make.words import (
-    DETERMINERS,
-    PAINTS,
-    distinct_colours,
-    pattern_words,
-    similar_colours,
-)
+from vap_make.colours import HUES_DEG, seen, similar, stands_out
+from vap_make.words import DETERMINERS, pattern_words
 
-COLOURED = 0.45
-"""How often a view's object is painted."""
 MIN_ASKED_PX = 20
 """Visible pixels of an object that is asked about."""
 TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
@@ -50,7 +41,7 @@ class Question:
 
 @value
 class QuestionedView:
-    """One view, coloured, and questions about it."""
+    """One view, and questions about it."""
 
     image: UInt8[np.ndarray, "s s 3"]
     questions: tuple[Question, ...]
@@ -60,15 +51,14 @@ class QuestionedView:
 class VisibleObject:
     """An object in view.
 
-    `words` may name it; `appearance` is all that it shows (a trace of its pattern is seen through
-    paint); `given` is the colour that it was given, or "".
+    `words` may name it; `appearance` is all that it shows; `colour` is its main one, or "".
     """
 
     look: Description
     kind: str
     words: frozenset[str]
     appearance: frozenset[str]
-    given: str
+    colour: str
 
 
 VisibleObjects = Mapping[int, VisibleObject]
@@ -83,35 +73,16 @@ def ask(
     n: int,
     rng: np.random.Generator,
 ) -> QuestionedView:
-    """Paint some objects of a view, where `ids` is i + 1 at names[i], and ask `n` questions.
+    """Ask `n` questions about a view, in which `ids` is i + 1 at names[i].
 
     `looks` are the captioner's descriptions of the objects.
 
     Raises: UnknownName, BadObject, as `get_object`.
     """
-    images = image[None]
-    visible = _visible_objects(ids, names, looks)
-    unused = set(PAINTS)
-    for i in visible:
-        pool = sorted(unused, key=PAINTS.index)
-        if pool and rng.random() < COLOURED:
-            colour = pool[int(rng.integers(len(pool)))]
-            unused.discard(colour)
-            mask = (ids == i + 1)[None]
-            images = painted(images, mask, colour, float(rng.uniform(*COAT)))
-            visible[i] = VisibleObject(
-                look=looks[i],
-                kind=visible[i].kind,
-                words=frozenset({colour.name}),
-                appearance=visible[i].appearance | {colour.name},
-                given=colour.name,
-            )
+    visible = _visible_objects(image, ids, names, looks)
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
-    shown = np.clip(images[0] * gain, 0, 255).astype(np.uint8)
-    questions = []
-    for _ in range(n):
-        questions.append(_question(ids, visible, rng))
-    return QuestionedView(shown, tuple(questions))
+    shown = np.clip(image * gain, 0, 255).astype(np.uint8)
+    return QuestionedView(shown, tuple(_question(ids, visible, rng) for _ in range(n)))
 
 
 def place(mask: np.ndarray) -> tuple[str, str]:
@@ -123,20 +94,24 @@ def place(mask: np.ndarray) -> tuple[str, str]:
 
 
 def _visible_objects(
-    ids: UInt8[np.ndarray, "s s"], names: Sequence[str], looks: Sequence[Description]
+    image: UInt8[np.ndarray, "s s 3"],
+    ids: UInt8[np.ndarray, "s s"],
+    names: Sequence[str],
+    looks: Sequence[Description],
 ) -> dict[int, VisibleObject]:
-    """The objects with enough visible pixels, as they are."""
+    """The objects with enough visible pixels."""
     visible = {}
     for i, name in enumerate(names):
-        if (ids == i + 1).sum() >= MIN_ASKED_PX:
-            colours = natural_colours(looks[i])
+        mask = ids == i + 1
+        if mask.sum() >= MIN_ASKED_PX:
+            colour, shown = seen([image], [mask])
             pattern = pattern_words(name)
             visible[i] = VisibleObject(
                 look=looks[i],
                 kind=objects.get_object(name).category,
-                words=frozenset({colours[0], *pattern}),
-                appearance=frozenset({*colours, *pattern}),
-                given="",
+                words=frozenset({colour, *pattern} - {""}),
+                appearance=shown | pattern,
+                colour=colour,
             )
     return visible
 
@@ -164,9 +139,9 @@ def _question(
         if rng.random() < 0.7:
             return _ask_wrong_colour(kind, visible, rng)
         return _ask_absent(visible, rng)
-    given = visible[target].given
-    if drawn < 0.74 and given and _is_only(kind, visible):
-        return Question(f"what colour is the {kind}", (given,), target)
+    colour = visible[target].colour
+    if drawn < 0.74 and colour and _is_only(kind, visible):
+        return Question(f"what colour is the {kind}", (colour,), target)
     return _ask_for_patches(target, phrase, visible[target], rng)
 
 
@@ -197,7 +172,7 @@ def _ask_wrong_colour(kind: str, visible: VisibleObjects, rng: np.random.Generat
             own |= rival.appearance
     pool = sorted(_without_akin(all_words, own))
     if not pool or rng.random() >= 0.5:
-        pool = [colour.name for colour in distinct_colours(own) if colour.name not in own]
+        pool = [word for word in HUES_DEG if stands_out(word, [frozenset(own)])]
     if not pool:
         return _ask_absent(visible, rng)
     text = _recognition_text(f"{rng.choice(pool)} {kind}", rng)
@@ -206,9 +181,9 @@ def _ask_wrong_colour(kind: str, visible: VisibleObjects, rng: np.random.Generat
 
 def _ask_absent(visible: VisibleObjects, rng: np.random.Generator) -> Question:
     """Is there a kind that is not there, mostly with a colour or pattern of something?"""
-    words = {colour.name for colour in PALETTE}
-    for seen in visible.values():
-        words |= seen.words
+    words = set(HUES_DEG)
+    for other in visible.values():
+        words |= other.words
     phrase = str(rng.choice(_absent_kinds(visible)))
     if rng.random() < 0.7:
         phrase = f"{rng.choice(sorted(words))} {phrase}"
@@ -221,7 +196,7 @@ def _ask_for_patches(
     """An instruction about an object; only the patches that show it answer."""
     kind = meant.kind
     text = str(rng.choice(_instructions(kind)))
-    if not meant.given and phrase != kind and rng.random() < 0.5:
+    if phrase != kind and rng.random() < 0.3:
         description = rng.choice([meant.look.short, meant.look.long])
         return Question(f"{text}. My {kind} is {description}.", (), target)
     determiner = rng.choice(DETERMINERS[1:])
@@ -248,8 +223,8 @@ def _absent_kinds(visible: VisibleObjects) -> list[str]:
     """The kinds that nothing in view is of, in alphabetical order."""
     absent = set(objects.CATEGORIES)
     for kind in objects.CATEGORIES:
-        for seen in visible.values():
-            if _is_same_kind(kind, seen.kind):
+        for other in visible.values():
+            if _is_same_kind(kind, other.kind):
                 absent.discard(kind)
     return sorted(absent)
 
@@ -262,8 +237,8 @@ def _is_same_kind(kind: str, other: str) -> bool:
 def _is_only(kind: str, visible: VisibleObjects) -> bool:
     """Whether exactly one object of this very kind is in view."""
     count = 0
-    for seen in visible.values():
-        count += seen.kind == kind
+    for other in visible.values():
+        count += other.kind == kind
     return count == 1
 
 
@@ -271,6 +246,6 @@ def _without_akin(words: set[str], appearance: Collection[str]) -> set[str]:
     """The words that cannot be taken for one of an appearance's."""
     kept = set()
     for word in words:
-        if similar_colours(word).isdisjoint(appearance):
+        if similar(word).isdisjoint(appearance):
             kept.add(word)
     return kept

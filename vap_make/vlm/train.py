@@ -124,7 +124,7 @@ def views(
     found = []
     spent_s = 0.0
     for number in range(stages):
-        shots = cached(folder, seed, number, held_out=held_out, look=draw_look)
+        shots = cached(folder, seed, number, held_out=held_out, look=draw_look, dyes=True)
         only_generic([get_object(name) for name in shots.names])
         spent_s += cost_s(stage_file(folder, seed, number, held_out))
         pictures = zip(shots.rgb, shots.ids, strict=True)
@@ -142,7 +142,7 @@ def collate(
     rng: np.random.Generator,
     config: MiniPI0Config,
 ) -> Batch:
-    """One batch: views drawn anew, coloured anew, with questions of their own.
+    """One batch: views drawn anew, with questions of their own.
 
     `looks` describes the objects, `number` gives the token of each word.
 
@@ -307,7 +307,7 @@ def _view(rgb: Rgb, ids: UInt8[np.ndarray, "h w"], shots: Shots) -> View:
 
 
 def _render(folder: Path, seed: int, held_out: bool, number: int) -> None:
-    cached(folder, seed, number, held_out=held_out, look=draw_look)
+    cached(folder, seed, number, held_out=held_out, look=draw_look, dyes=True)
 
 
 def _tokenize_answers(questions: Sequence[Question], number: dict[str, int]) -> Tensor:

@@ -1,0 +1,74 @@
+"""Tints in training scenes, for a recipe that has a share of them; the benchmarks' have none.
+
+Whether a scene is tinted, and which objects carry the tints, is drawn before anything else, by
+equal odds for every object that may be meant and for none.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from vap_core.base.types import Colour
+from vap_core.prompt import tint
+from vap_make.colours import stands_out
+from vap_make.recipe import TINTS, Recipe
+
+LOST = 0.12
+"""How often a view's tint is missing (a tracker that lost its target); one view keeps it."""
+Images = UInt8[np.ndarray, "c s s 3"]
+"""The views of one frame."""
+
+
+def draw_tints(
+    shown: Sequence[frozenset[str]], recipe: Recipe, rng: np.random.Generator, at_once: int = 1
+) -> dict[int, Colour]:
+    """The tint of each object that carries one, of `at_once` at most; `shown` are their colours."""
+    tints: dict[int, Colour] = {}
+    if rng.random() >= recipe.tint_share:
+        return tints
+    for _ in range(at_once):
+        carrier = int(rng.integers(len(shown) + 1)) - 1
+        if carrier < 0 or carrier in tints:
+            continue
+        left = [colour for colour in TINTS if colour not in tints.values()]
+        clear = [colour for colour in left if stands_out(colour.name, shown)] or left
+        tints[carrier] = clear[int(rng.integers(len(clear)))]
+    return tints
+
+
+def tint_views(
+    images: Images,
+    ids: UInt8[np.ndarray, "c s s"],
+    tints: Mapping[int, Colour],
+    recipe: Recipe,
+    rng: np.random.Generator,
+) -> Images:
+    """The views with tints where `ids` is i + 1, as VAP does it with a tracker's masks."""
+    tinted = images.copy()
+    for i, colour in tints.items():
+        alpha = float(rng.uniform(*recipe.opacity))
+        for view, mask in enumerate(_track(ids == i + 1, rng)):
+            tinted[view] = tint(tinted[view], mask, colour, alpha)
+    return tinted
+
+
+def roughen_mask(mask: Bool[np.ndarray, "s s"], rng: np.random.Generator) -> np.ndarray:
+    """A mask as a tracker draws it: now and then a little off, swollen or shrunk."""
+    kind = rng.random()
+    if kind < 0.5 or not mask.any():
+        return mask
+    if kind < 0.7:
+        return np.roll(mask, rng.integers(-2, 3, 2), axis=(0, 1))
+    change = cv2.dilate if kind < 0.85 else cv2.erode
+    return change(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+def _track(masks: Bool[np.ndarray, "c s s"], rng: np.random.Generator) -> np.ndarray:
+    """Masks as a tracker draws them, at least one view's."""
+    kept = rng.random(len(masks)) > LOST
+    kept[rng.integers(len(masks))] = True
+    return np.stack(
+        [roughen_mask(mask, rng) & bool(keep) for mask, keep in zip(masks, kept, strict=True)]
+    )
