@@ -30,6 +30,8 @@ WORDS = (*NEUTRALS, *HUES_DEG)
 """Every word that an object may be called by."""
 CHROMA = 14.0
 """Chroma from which a pixel's hue names it, if it is no brown or beige."""
+RED_CHROMA, RED_DEG = 22.0, 42.0
+"""A dull colour is red, and no brown, from this chroma and below this hue angle on."""
 MAIN, SHOWN = 0.4, 0.1
 """Shares of an object's pixels from which a word is what it is called, or is seen on it."""
 NEAR = {
@@ -55,8 +57,10 @@ def shares(rgb: Rgb, mask: Mask) -> dict[str, float]:
     index = colour_indices(rgb, mask)[mask]
     angle = np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) % 360.0
     hue = len(NEUTRALS) + np.digitize(angle, list(HUES_DEG.values())) % len(HUES_DEG)
-    neutral = [COLOURS.index(name) for name in ("brown", "beige")]
-    vivid = (np.hypot(lab[:, 1], lab[:, 2]) >= CHROMA) & ~np.isin(index, neutral)
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    earthy = np.isin(index, [COLOURS.index("brown"), COLOURS.index("beige")])
+    earthy &= (chroma < RED_CHROMA) | ((angle > RED_DEG) & (angle < HUES_DEG["yellow"]))
+    vivid = (chroma >= CHROMA) & ~earthy
     # What describe calls pink or purple below that chroma is nearest to grey.
     pale = np.where(index < len(NEUTRALS), index, NEUTRALS.index("grey"))
     counts = np.bincount(np.where(vivid, hue, pale), minlength=len(WORDS))

@@ -16,7 +16,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from vap_core.base.errors import one_of
-from vap_core.base.types import Rgb, value
+from vap_core.base.types import Mask, Rgb, value
 from vap_core.simulation.assets.objects import (
     CATEGORIES,
     CLUTTER,
@@ -28,7 +28,7 @@ from vap_core.simulation.assets.objects import (
     ObjectModel,
 )
 from vap_core.simulation.assets.shapes import Mesh, Solid, Srgb, Texture
-from vap_make.colours import seen
+from vap_make.colours import HUES_DEG, seen, shares
 from vap_make.objects.families import FAMILIES, Family
 from vap_make.objects.generics import draw_texture, draw_twin
 from vap_make.objects.shapes import Shape
@@ -38,9 +38,11 @@ FAMILY_NUMBERS: dict[str, int] = {family.stem: i for i, family in enumerate(FAMI
 """Seeds depend on these numbers."""
 WHOLE, SOAKED = 0.75, (0.35, 0.9)
 """Share of dyed objects that are dyed all around, and how much dye their materials take."""
-UNDYED, ONE_DYED, MOST_DYED = 0.2, 0.4, 0.75
+UNDYED, ONE_DYED, MOST_DYED = 0.1, 0.25, 0.9
 """Shares of scenes in which nothing is dyed, and one object; and how many objects of the others."""
-DYES = 10_000
+TRACE = 0.03
+"""Share of materials from which they have a colour that was to be avoided."""
+DYES = 1_000
 """Dyes have numbers below this one."""
 
 
@@ -166,10 +168,11 @@ def dyed(model: ObjectModel, dye: int) -> ObjectModel:
 def dye_some(
     models: Sequence[ObjectModel], rng: np.random.Generator, avoid: Collection[str] = ()
 ) -> list[ObjectModel]:
-    """The objects, none of them dyed, one, or most, each in a colour of its own.
+    """The objects, none of them dyed, one, or most, each in a hue that has a word of its own.
 
-    Raises: ValueError where one that is not dyed has a colour to avoid.
+    Raises: ValueError where one that is not dyed has a colour to avoid, or a word has no dye.
     """
+    words = rng.permutation([word for word in HUES_DEG if word not in avoid]).tolist()
     drawn, chances = rng.random(), rng.random(len(models))
     if drawn < UNDYED:
         chances[:] = 1.0
@@ -177,28 +180,44 @@ def dye_some(
         chances = np.where(chances == chances.min(), 0.0, 1.0)
     chosen = []
     for model, chance in zip(models, chances, strict=True):
-        while chance < MOST_DYED:
-            coloured = dyed(model, int(rng.integers(1, DYES)))
-            if not _shows(coloured, avoid):
-                break
-        chosen.append(coloured if chance < MOST_DYED else model)
+        if chance < MOST_DYED:
+            model = _dyed_as(words.pop(), model, rng, avoid)
+        chosen.append(model)
     if any(_shows(model, avoid) for model in chosen):
         raise ValueError("dye_some: an object has a colour to avoid; draw others")
     return chosen
 
 
+def _dyed_as(
+    word: str, model: ObjectModel, rng: np.random.Generator, avoid: Collection[str]
+) -> ObjectModel:
+    """The object with a dye that makes its materials be called by the word."""
+    for _ in range(DYES):
+        coloured = dyed(model, int(rng.integers(1, DYES)))
+        if material_colours(coloured.name)[0] == word and not _shows(coloured, avoid):
+            return coloured
+    raise ValueError(f"dye_some: no dye makes {model.name} {word}; draw others")
+
+
 def _shows(model: ObjectModel, words: Collection[str]) -> bool:
-    """Whether the object's own materials have one of the colours."""
-    return not material_colours(model.name)[1].isdisjoint(words)
+    """Whether a trace of one of the colours is in the object's own materials."""
+    found = shares(*_swatch(model.name))
+    return any(found[word] > TRACE for word in words)
 
 
 @lru_cache(maxsize=8192)
 def material_colours(name: str) -> tuple[str, frozenset[str]]:
     """The colours of a drawn object's materials in white light, as `colours.seen` tells them."""
+    picture, whole = _swatch(name)
+    return seen([picture], [whole])
+
+
+def _swatch(name: str) -> tuple[Rgb, Mask]:
+    """A drawn object's materials."""
     model = draw(name)
     assert model is not None
     picture = model.form.picture()[::4, ::4]
-    return seen([picture], [np.ones(picture.shape[:2], bool)])
+    return picture, np.ones(picture.shape[:2], bool)
 
 
 def draw(name: str) -> ObjectModel | None:
