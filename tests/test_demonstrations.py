@@ -8,12 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from vap_core.base.types import Description
-from vap_core.perception import describe
-from vap_core.prompt import PALETTE, has_colour
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS, suite
 from vap_make.films import demonstrations
@@ -30,11 +26,10 @@ from vap_make.films.demonstrations import (
 )
 from vap_make.policy import train as policy
 from vap_make.policy.batches import SPIN_Z, Frames, statistics
-from vap_make.policy.colouring import colour_of, painted, roughen_mask, tinted
-from vap_make.policy.commands import Known, command, near, phrase_instruction
+from vap_make.policy.commands import Known, colours_of, command, near, phrase_instruction
 from vap_make.recipe import FILMED, RECIPES, filmed_tasks
 from vap_make.vlm.questions import MIN_ASKED_PX, ask, place
-from vap_make.words import PAINTS, pattern_words, vocabulary
+from vap_make.words import pattern_words, vocabulary
 
 SUITE = "simpler-bridge"
 RECIPE = RECIPES[SUITE]
@@ -201,33 +196,31 @@ def test_a_command_says_what_its_picture_shows(
 ) -> None:
     _, films = stage
     words, forms = set(vocabulary()), Counter[str]()
-    colours = {colour.name: colour for colour in PAINTS}
-    given = 0
-    for seed in range(160):
+    for seed in range(240):
         film, rng = films[seed % len(films)], np.random.default_rng(seed)
         t = int(rng.integers(len(film.action)))
-        made = command(film, t, RECIPE, known, rng)
+        colours = colours_of(film)
+        made = command(film, t, RECIPE, known, colours, rng)
+        if made is None:
+            continue
         forms[made.form] += 1
         assert set(re.findall(r"[\w']+", made.text.lower())) <= words
-        mask, rivals = film.ids[t, 0] == 1, [i for i in range(1, len(film.names)) if i != film.goal]
+        rivals = [i for i in range(1, len(film.names)) if i != film.goal]
         assert list(made.things) == [0, *rivals]
         names = [film.names[i] for i in made.things]
-        looks = [known.captions[name] for name in names]
+        target = known.captions[names[0]]
         if made.form == "plain":
             assert near(film, t, SUITE, rivals)
         elif made.form == "described":
-            length = "long" if looks[0].long in made.text else "short"
-            assert getattr(looks[0], length) in made.text
+            length = "long" if target.long in made.text else "short"
+            assert getattr(target, length) in made.text
             assert distinguishes(known.captions, names, length)
         else:
-            word = colour_of(0, looks, made.colouring)
+            word, _ = colours[0]
             assert f" {word}" in made.text
-            is_given = 0 in made.colouring.painted or 0 in made.colouring.tinted
-            if is_given and word in {one.name for one in PALETTE} and mask.sum() > 60:
-                given += 1
-                assert has_colour(made.images[0][mask], colours[word]).mean() > 0.15, made.text
-    assert min(forms[form] for form in ("coloured", "described", "plain")) > 5
-    assert given > 5
+            assert all(word not in colours[i][1] for i in rivals), made.text
+    assert forms["plain"] > 5
+    assert forms["described"] > 5
 
 
 def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
@@ -239,26 +232,6 @@ def test_my_is_said_of_a_generic_thing_too_and_once() -> None:
         "put the blue camera on the plate",
         "put my camera on the plate. My camera is blue.",
     }
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 2**16), st.floats(0.1, 1.0))
-def test_only_what_is_masked_changes_colour(seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    images, masks = rng.integers(0, 256, (2, 12, 12, 3), np.uint8), rng.random((2, 12, 12)) < 0.3
-    for change in (tinted, painted):
-        out = change(images, masks, PALETTE[seed % len(PALETTE)], share)
-        assert (out[~masks] == images[~masks]).all()
-    exact = (1 - share) * images[masks].astype(np.float32) + share * np.asarray(
-        PALETTE[0].rgb, np.float32
-    )
-    assert np.abs(tinted(images, masks, PALETTE[0], share)[masks] - exact).max() <= 0.51
-    empty = np.zeros((12, 12), bool)
-    assert not roughen_mask(empty, rng).any()
-
-
-def test_the_vocabulary_has_every_word_of_captions_and_colours() -> None:
-    assert {*describe.WORDS, *(colour.name for colour in PAINTS)} <= set(vocabulary())
 
 
 def test_captions_are_kept_and_say_what_is_seen(tmp_path: Path) -> None:

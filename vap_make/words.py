@@ -9,7 +9,6 @@ from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.objects import CATEGORIES, CLUTTER
 from vap_core.simulation.assets.shapes import Texture
 from vap_core.simulation.suites import BENCHMARKS
-from vap_make.colours import WORDS as COLOUR_WORDS
 
 DETERMINERS = ("my", "the", "a")
 FIRST = ("<pad>", "<unk>", "\n")
@@ -42,7 +41,7 @@ def vocabulary() -> tuple[str, ...]:
     for benchmark in BENCHMARKS.values():
         for task in benchmark.tasks:
             texts.append(task.instruction)
-    texts += [*(colour.name for colour in PALETTE), *COLOUR_WORDS]
+    texts += [colour.name for colour in PALETTE]
     words = []
     for text in (*texts, *CATEGORIES, *CLUTTER):
         words += re.findall(r"[\w']+", text.lower())

@@ -28,7 +28,7 @@ from vap_core.simulation.assets.objects import (
     ObjectModel,
 )
 from vap_core.simulation.assets.shapes import Mesh, Solid, Srgb, Texture
-from vap_make.colours import HUES_DEG, seen, shares
+from vap_make.colours import HUES_DEG, MAIN, seen, shares
 from vap_make.objects.families import FAMILIES, Family
 from vap_make.objects.generics import draw_texture, draw_twin
 from vap_make.objects.shapes import Shape
@@ -58,6 +58,13 @@ class Dye:
     share: float
     around: float = 1.0
 
+    def on(self, picture: Rgb) -> Rgb:
+        """The materials in `picture`, dyed."""
+        dyed = picture.astype(np.float32)
+        part = dyed[:, : round(self.around * picture.shape[1])]
+        part += self.share * (np.array(self.rgb, np.float32) - part)
+        return np.rint(dyed).astype(np.uint8)
+
 
 @value
 class Drawn:
@@ -75,12 +82,7 @@ class Drawn:
 
     def picture(self) -> Rgb:
         picture = render_atlas(self.texture, self.body.aspect())
-        if self.dye is None:
-            return picture
-        dyed = picture.astype(np.float32)
-        part = dyed[:, : round(self.dye.around * picture.shape[1])]
-        part += self.dye.share * (np.array(self.dye.rgb, np.float32) - part)
-        return np.rint(dyed).astype(np.uint8)
+        return picture if self.dye is None else self.dye.on(picture)
 
 
 def _spelled(body: Shape) -> dict[str, Any]:
@@ -120,8 +122,9 @@ FIXED: dict[str, ObjectModel] = {name: _drawn(model) for name, model in OBJECTS.
 """Personal instances, look-alikes and props: their parameters are the catalogue's rows."""
 
 
-def draw_dye(rng: np.random.Generator) -> Dye:
+def draw_dye(number: int) -> Dye:
     """Any hue, more or less vivid; now and then only half an object is dyed."""
+    rng = np.random.default_rng([22, number])
     vivid, bright = rng.uniform((0.65, 0.4), 1.0)
     red, green, blue = (round(255 * c) for c in hsv_to_rgb(rng.random(), vivid, bright))
     around = 1.0 if rng.random() < WHOLE else float(rng.uniform(0.4, 0.7))
@@ -150,11 +153,9 @@ def generic_instance(kind: str, index: int, twin: int = 0, dye: int = 0) -> Obje
         twin_rng = np.random.default_rng([21, number, index, twin])
         body, texture = draw_twin(family, body, texture, twin_rng)
         name = f"{name}-{twin}"
-    colour = None
     if dye:
-        colour = draw_dye(np.random.default_rng([22, number, index, twin, dye]))
         name = f"{family.stem}-generic-{index:04d}-{twin}-{dye}"
-    shape, form = _spelled(body), Drawn(body, texture, colour)
+    shape, form = _spelled(body), Drawn(body, texture, draw_dye(dye) if dye else None)
     return ObjectModel(name, family.category, "generic", shape, texture, mass_kg, form)
 
 
@@ -183,7 +184,8 @@ def dye_some(
         if chance < MOST_DYED:
             model = _dyed_as(words.pop(), model, rng, avoid)
         chosen.append(model)
-    if any(_shows(model, avoid) for model in chosen):
+    found = [shares(*_swatch(model)) for model in chosen]
+    if any(of_model[word] > TRACE for of_model in found for word in avoid):
         raise ValueError("dye_some: an object has a colour to avoid; draw others")
     return chosen
 
@@ -192,30 +194,25 @@ def _dyed_as(
     word: str, model: ObjectModel, rng: np.random.Generator, avoid: Collection[str]
 ) -> ObjectModel:
     """The object with a dye that makes its materials be called by the word."""
-    for _ in range(DYES):
-        coloured = dyed(model, int(rng.integers(1, DYES)))
-        if material_colours(coloured.name)[0] == word and not _shows(coloured, avoid):
-            return coloured
+    picture, whole = _swatch(model)
+    for number in rng.permutation(np.arange(1, DYES)).tolist():
+        found = shares(draw_dye(number).on(picture), whole)
+        if found[word] >= MAIN and all(found[other] <= TRACE for other in avoid):
+            return dyed(model, number)
     raise ValueError(f"dye_some: no dye makes {model.name} {word}; draw others")
-
-
-def _shows(model: ObjectModel, words: Collection[str]) -> bool:
-    """Whether a trace of one of the colours is in the object's own materials."""
-    found = shares(*_swatch(model.name))
-    return any(found[word] > TRACE for word in words)
 
 
 @lru_cache(maxsize=8192)
 def material_colours(name: str) -> tuple[str, frozenset[str]]:
     """The colours of a drawn object's materials in white light, as `colours.seen` tells them."""
-    picture, whole = _swatch(name)
+    model = draw(name)
+    assert model is not None
+    picture, whole = _swatch(model)
     return seen([picture], [whole])
 
 
-def _swatch(name: str) -> tuple[Rgb, Mask]:
-    """A drawn object's materials."""
-    model = draw(name)
-    assert model is not None
+def _swatch(model: ObjectModel) -> tuple[Rgb, Mask]:
+    """An object's materials."""
     picture = model.form.picture()[::4, ::4]
     return picture, np.ones(picture.shape[:2], bool)
 
