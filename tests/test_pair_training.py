@@ -44,7 +44,7 @@ def film(rng: np.random.Generator, names: tuple[str, ...] = (), side: int = 8, t
         state[:, :2] = places[:, 0, :2] - robots.get("so101").base_world[:2]
     pictures = -(-t // every(SUITE))
     return Film(
-        images=rng.integers(0, 256, (pictures, 3, side, side, 3), np.uint8),
+        images=rng.integers(100, 110, (pictures, 3, side, side, 1), np.uint8).repeat(3, axis=-1),
         ids=rng.integers(0, 5, (pictures, 3, side, side)).astype(np.uint8),
         state=state,
         action=rng.normal(size=(t, 6)).astype(np.float32),

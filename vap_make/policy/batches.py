@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
+from vap_core.base.errors import BadOutput
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
 from vap_core.policies.mini_pi0.processor_mini_pi0 import encode
 from vap_core.policies.scripted.expert import TURN_RAD_S
@@ -96,6 +97,11 @@ class Frames:
             if all(held_out.isdisjoint(shown) for _, shown in colours):
                 self.films.append(film)
                 self.colours.append(colours)
+        if films and not self.films:
+            raise BadOutput(
+                f"train policy: every film shows {' or '.join(sorted(held_out))}, which the recipe "
+                "holds out; film others with another --seed or --cache."
+            )
         films = self.films
         self.stats = stats
         self.config = config
