@@ -386,8 +386,8 @@ def vlm(
         typer.Option(
             min=2, help="Scenes with generic objects, of about sixteen views each; rendered first."
         ),
-    ] = 540,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 1600,
+    ] = 320,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 2400,
     seed: RandomSeed = 0,
     minutes: Minutes = None,
     cache: Rendered = None,

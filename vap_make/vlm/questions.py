@@ -7,7 +7,9 @@ cup in this image*: yes or no, equally often; the hard no's name a colour that n
 colour is the cup*: red. *Pick up the red cup*, *pick up my cup. My cup is white with blue spots*:
 no words; only the patches that show it are asked for. Colours are those of an object's materials,
 as the view's pixels show them; an object is named by its colour or pattern where that distinguishes
-it from others of its kind, and by its kind where it is the only one.
+it from others of its kind, and by its kind where it is the only one. *Can you recognize <my_0> in
+this image*: each object of a crew of look-alikes has a word of its own while the model is trained,
+so that it learns to tell instances apart by a word's embedding, as a learned word does it.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -17,6 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.base.types import Description, value
+from vap_core.policies.mini_pi0.learned_token import QUESTION
 from vap_core.simulation.assets import objects
 from vap_core.simulation.suites import BENCHMARKS
 from vap_make.colours import HUES_DEG, seen, similar, stands_out
@@ -31,12 +34,14 @@ TASKS = tuple(chain.from_iterable(suite.tasks for suite in BENCHMARKS.values()))
 class Question:
     """A question about one view, the answer's words, and the index of the object meant, or -1.
 
-    There is no answer where only patches are asked for.
+    There is no answer where only patches are asked for. `instance` is the index of the object whose
+    own word is in the text, or -1.
     """
 
     text: str
     answer: tuple[str, ...]
     target: int
+    instance: int = -1
 
 
 @value
@@ -72,17 +77,27 @@ def ask(
     looks: Sequence[Description],
     n: int,
     rng: np.random.Generator,
+    own: float = 0.0,
 ) -> QuestionedView:
     """Ask `n` questions about a view, in which `ids` is i + 1 at names[i].
 
-    `looks` are the captioner's descriptions of the objects.
+    `looks` are the captioner's descriptions of the objects; `own` is the share of questions about
+    one of the look-alikes by its own word.
 
     Raises: UnknownName, BadObject, as `get_object`.
     """
     visible = _visible_objects(image, ids, names, looks)
+    kinds = [objects.get_object(name).category for name in names]
+    crew = [i for i, kind in enumerate(kinds) if kind == kinds[0]]
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
     shown = np.clip(image * gain, 0, 255).astype(np.uint8)
-    return QuestionedView(shown, tuple(_question(ids, visible, rng) for _ in range(n)))
+    questions = []
+    for _ in range(n):
+        asks_own = rng.random() < own
+        questions.append(
+            _ask_for_instance(crew, visible, rng) if asks_own else _question(ids, visible, rng)
+        )
+    return QuestionedView(shown, tuple(questions))
 
 
 def place(mask: np.ndarray) -> tuple[str, str]:
@@ -143,6 +158,19 @@ def _question(
     if drawn < 0.74 and colour and _is_only(kind, visible):
         return Question(f"what colour is the {kind}", (colour,), target)
     return _ask_for_patches(target, phrase, visible[target], rng)
+
+
+def _ask_for_instance(
+    crew: Sequence[int], visible: VisibleObjects, rng: np.random.Generator
+) -> Question:
+    """Is this very one of the look-alikes there? Yes and no are as frequent where both are true."""
+    there = [i for i in crew if i in visible]
+    absent = [i for i in crew if i not in visible]
+    pool = there if there and (not absent or rng.random() < 0.5) else absent
+    i = int(rng.choice(pool))
+    return (
+        Question(QUESTION, ("yes",), i, i) if i in visible else Question(QUESTION, ("no",), -1, i)
+    )
 
 
 def _phrase(i: int, visible: VisibleObjects, rng: np.random.Generator) -> str | None:

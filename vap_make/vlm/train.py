@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -27,6 +27,7 @@ from vap_core.base.files import make_folder, parse_json, write_atomic, writing
 from vap_core.base.types import Description, Rgb, value
 from vap_core.policies.lerobot.checkpoints import CAPTIONS, TRAINING_CARD
 from vap_core.policies.mini_pi0.configuration_mini_pi0 import MiniPI0Config
+from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.policies.mini_pi0.modeling_mini_pi0 import fused_attention
 from vap_core.policies.mini_pi0.vlm import ANSWER, MiniVlm, load_vlm
 from vap_core.simulation.assets.objects import get_object
@@ -44,7 +45,10 @@ from vap_make.vlm.questions import Question, ask
 SCENES = "vlm"
 SEEN = 0.5
 """Weight of the patches beside the words."""
-KINDS = ("where", "yes", "no", "colour")
+OWN_STD, FASTER = 0.2, 30.0
+"""Deviation of the objects' own words to begin with, and how much faster they are learned: each is
+asked for in few batches."""
+KINDS = ("own", "where", "yes", "no", "colour")
 HELD_OUT = 30
 """Stages with unseen objects that the result is measured on."""
 HELD_OUT_BATCHES = 16
@@ -53,12 +57,16 @@ HELD_OUT_BATCHES = 16
 
 @dataclass(frozen=True)
 class Recipe(Sizes):
-    """How long, how fast, how large. `questions` are asked of each of `batch` views."""
+    """How long, how fast, how large. `questions` are asked of each of `batch` views.
 
-    stages: int = 540
-    steps: int = 1600
+    `own` is the share of those about one of several look-alikes, by a word of its own.
+    """
+
+    stages: int = 320
+    steps: int = 2400
     batch: int = 64
     questions: int = 2
+    own: float = 0.3
     rate: float = 1e-3
     seed: int = 0
 
@@ -77,22 +85,26 @@ class Batch:
     """Views, questions, answers and patches.
 
     Views are b x 3 x s x s in 0..1; the questions of each view follow each other (q in all);
-    answers are q x ANSWER tokens, of which 0 does not count; patches are q x p.
+    answers are q x ANSWER tokens, of which 0 does not count; patches are q x p. `instances` are q
+    numbers of objects that have a word of their own in their question, else -1.
     """
 
     images: Tensor
     questions: list[Question]
     answers: Tensor
     patches: Tensor
+    instances: Tensor
 
 
 class Learner(nn.Module):
-    """What is trained: the model, and the score of its patches."""
+    """What is trained: the model, the score of its patches, and a word for each of `n` objects."""
 
-    def __init__(self, config: MiniPI0Config) -> None:
+    def __init__(self, config: MiniPI0Config, n: int) -> None:
         super().__init__()
         self.vlm = MiniVlm(config)
         self.shown = PatchScores(config.width)
+        self.own_words = nn.Embedding(n, config.width)
+        nn.init.normal_(self.own_words.weight, std=OWN_STD / FASTER)
 
 
 def configuration(recipe: Recipe) -> MiniPI0Config:
@@ -148,9 +160,11 @@ def collate(
 
     Raises: as `ask`.
     """
+    order = {name: i for i, name in enumerate(looks)}
     images = []
     questions = []
     patches = []
+    instances = []
     for i in rng.integers(len(pool), size=recipe.batch):
         view = pool[i]
         described = [looks[name] for name in view.names]
@@ -160,6 +174,7 @@ def collate(
             names=view.names,
             looks=described,
             n=recipe.questions,
+            own=recipe.own,
             rng=rng,
         )
         images.append(questioned.image)
@@ -167,11 +182,14 @@ def collate(
             questions.append(question)
             meant = (view.ids == question.target + 1) & (question.target >= 0)
             patches.append(patch_shares(meant, config.patch))
+            own = question.instance
+            instances.append(order[view.names[own]] if own >= 0 else -1)
     return Batch(
         images=torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255,
         questions=questions,
         answers=_tokenize_answers(questions, number),
         patches=torch.from_numpy(np.stack(patches)).float(),
+        instances=torch.tensor(instances),
     )
 
 
@@ -185,7 +203,11 @@ def losses(learner: Learner, batch: Batch) -> tuple[Tensor, Figures]:
     tokens, there = vlm.tokenize(texts)
     per_view = len(batch.questions) // len(batch.images)
     patches = vlm.embed_images(batch.images).repeat_interleave(per_view, 0)
-    scores, hidden = vlm(patches, tokens, there, batch.answers)
+    embedded = vlm.towers.embed_language_tokens(tokens)
+    is_own = (tokens == vlm.vocabulary[WORD]) & (batch.instances >= 0)[:, None]
+    own = FASTER * learner.own_words(batch.instances.clamp(min=0))[:, None]
+    embedded = torch.where(is_own[..., None], own, embedded)
+    scores, hidden = vlm.read(patches, embedded, there, batch.answers)
     words = F.cross_entropy(scores.flatten(0, 1), batch.answers.flatten(), ignore_index=0)
     heat, hit = patch_loss(learner.shown(hidden), batch.patches)
     matches = (scores.argmax(-1) == batch.answers) | (batch.answers == 0)
@@ -221,7 +243,7 @@ def train(
         config = configuration(recipe)
         # Initial weights only; every other draw comes from the step's stream.
         torch.manual_seed(recipe.seed)
-        learner = Learner(config)
+        learner = Learner(config, len(looks))
         number = learner.vlm.vocabulary
 
         def step_losses(model: Learner, step: int) -> tuple[Tensor, Figures]:
@@ -251,7 +273,9 @@ def train(
         with torch.no_grad():
             for i in range(HELD_OUT_BATCHES):
                 rng = np.random.default_rng([76, i])
-                batch = collate(recipe, held_out, looks, number, rng, config)
+                # Nobody has learned a word of theirs.
+                asked = replace(recipe, own=0.0)
+                batch = collate(asked, held_out, looks, number, rng, config)
                 figures.append(losses(mean, batch)[1])
         spent_s = scenes_s + more_s + captions_s + log[-1]["cpu_s"]
         about = {
@@ -342,5 +366,7 @@ def _kind(question: Question) -> str:
     """
     if not question.answer:
         return ""
+    if question.instance >= 0:
+        return "own"
     first_word = question.text.split()[0]
     return {"where": "where", "what": "colour"}.get(first_word, question.answer[0])
