@@ -23,7 +23,6 @@ from vap_core.policies.names import label_of
 from vap_core.simulation import suites
 from vap_core.simulation.scenes import build
 from vap_core.study.store import open_run
-from vap_make.policy.start import read_start
 
 BEFORE = "policy_preprocessor_step_3_normalizer_processor.safetensors"
 AFTER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
@@ -171,7 +170,6 @@ CODE = (
 DOORS = {
     "load": lambda folder, out: load_policy(folder),
     "attach": lambda folder, out: attach(folder, out / "attached", out / "memory"),
-    "train --start": lambda folder, out: read_start(folder, None, 0),
 }
 
 
@@ -219,7 +217,7 @@ def test_numbers_that_are_none_are_refused(
 
 @pytest.mark.parametrize("door", DOORS)
 def test_no_door_reads_beyond_the_folder(copy: Path, tmp_path: Path, door: str) -> None:
-    """`train --start` filled the memory with a configuration that was a device."""
+    """A configuration that is a device once filled the memory."""
     mug = personal("mug", "cup", (40, 120, 110))
     save(tmp_path / "memory", replace(mug, encoder=load_stack("embedded").encoder.name))
     whole = (copy / PIPELINES[0]).read_text()

@@ -2,19 +2,13 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import load_file
 
-from vap_core.base.errors import BadPolicy
 from vap_core.base.types import Description
 from vap_core.instruction.rule import parse, rewrite
 from vap_core.perception.describe import COLOURS
-from vap_core.policies.lerobot.adapter import load_policy
-from vap_core.policies.names import SHIPPED
 from vap_core.prompt import PALETTE
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
@@ -25,14 +19,12 @@ from vap_make.colours import HUES_DEG
 from vap_make.films import demonstrations, pairs
 from vap_make.films.demonstrations import Film
 from vap_make.lists import shared
-from vap_make.policy import start, train
 from vap_make.policy.commands import Known, command, phrase_pair
 from vap_make.recipe import RECIPES, every, filmed_tasks
 
 SUITE = "shared-pair"
 RECIPE = RECIPES[SUITE]
 TASKS = filmed_tasks(SUITE)
-START = SHIPPED / RECIPE.start
 
 
 def film(rng: np.random.Generator, names: tuple[str, ...] = (), side: int = 8, t: int = 1) -> Film:
@@ -139,48 +131,3 @@ def test_the_expert_puts_a_generic_object_near_another(monkeypatch: pytest.Monke
     limit = radius_m(target) + radius_m(goal) + NEAR_M
     assert apart[0] > limit > apart[-1]
     assert all((made.ids == i + 1).any() for i in range(4)), "every object is seen"
-
-
-@pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache with invented films of two stages."""
-    folder = tmp_path_factory.mktemp("pairs") / train.FILMS
-    rng = np.random.default_rng(3)
-    for stage in range(2):
-        names = demonstrations.draw_objects(suite(SUITE), TASKS[0], rng)
-        made = film(rng, tuple(names), side=demonstrations.SIDE, t=9)
-        demonstrations._write_stage(demonstrations.stage_file(folder, SUITE, 0, stage), [made], 1.0)
-    return folder.parent
-
-
-def test_the_training_goes_on_from_the_shipped_policy(filmed: Path, tmp_path: Path) -> None:
-    """Its words and scales stay, its weights move, and the card says what it went on from."""
-    recipe = replace(RECIPE, stages=2, steps=2, batch=2, draws=1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "HELD_OUT", 2)
-        card = train.train(recipe, tmp_path / "pairs", cache=filmed, jobs=1)
-    assert card["start"]["name"] == RECIPE.start
-    assert len(card["start"]["sha256"]) == 64
-    before = load_file(START / "model.safetensors")
-    after = load_file(tmp_path / "pairs" / "model.safetensors")
-    assert before.keys() == after.keys()
-    words = next(name for name in before if name.endswith("embed_tokens.weight"))
-    assert torch.equal(before[words], after[words]), "words mean what they meant"
-    moved = [name for name in before if not torch.equal(before[name], after[name])]
-    assert len(moved) > len(before) / 2
-    far = max(float((before[name].float() - after[name].float()).abs().max()) for name in moved)
-    assert far < 0.05, "it goes on, and does not begin anew"
-    scales = load_file(tmp_path / "pairs" / start.SCALES)
-    for name, tensor in load_file(START / start.SCALES).items():
-        assert torch.equal(tensor, scales[name])
-    trained = load_policy(tmp_path / "pairs")
-    assert trained.execute == load_policy(START).execute
-
-
-def test_a_start_that_is_no_policy_is_named(
-    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(start, "SHIPPED", tmp_path)
-    recipe = replace(RECIPE, stages=2, steps=1)
-    with pytest.raises(BadPolicy, match=r"mini-pi0-tabletop-longer is no mini-pi0 to go on from"):
-        train.train(recipe, tmp_path / "out", cache=filmed, jobs=1)

@@ -28,7 +28,7 @@ from vap_core.study import engine, trials
 from vap_core.study.engine import run_job
 from vap_core.study.methods import make_prompter
 from vap_core.study.trials import Study
-from vap_make.policy.start import initialise_policy
+from vap_make.policy.train import initialise_policy
 from vap_make.words import vocabulary
 
 SUITE, TASK, STATE, ACTION = "simpler-bridge", "put-camera", 13, 7

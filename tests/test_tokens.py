@@ -24,7 +24,7 @@ from vap_core.policies.mini_pi0.learned_token import (
 )
 from vap_core.policies.mini_pi0.vlm import MiniVlm, load_vlm
 from vap_core.policies.protocol import PolicyInput
-from vap_make.policy.start import initialise_policy
+from vap_make.policy.train import initialise_policy
 from vap_make.words import vocabulary
 
 from .test_mini_pi0 import checkpoint, config  # noqa: F401

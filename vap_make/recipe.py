@@ -48,9 +48,7 @@ class Recipe(Sizes):
     the shares of those that do not. `held_out_words` are in no command and on no object. `taught`
     objects have a learned word, which `learned` of their commands use. A scene is tinted with the
     odds `tint_share`, whatever the command: any object that may be meant carries the tint, or none,
-    with equal odds; the tints are TINTS, of an `opacity` in that range.
-
-    The policy begins with nothing, or goes on from `start`: a shipped one's name, or a folder.
+    with equal odds; the tints are TINTS.
 
     Films: none shows `held_out_category`, which the suite evaluates. `draws` flow samples share one
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`
@@ -64,7 +62,7 @@ class Recipe(Sizes):
     held_out_category: str
     stages: int = 320
     steps: int = 6_400
-    batch: int = 128
+    batch: int = 64
     chunk: int = 4
     execute: int = 4
     draws: int = 4
@@ -73,13 +71,11 @@ class Recipe(Sizes):
     focus: float = 3.0
     angle_noise_rad: float = 0.02
     tint_share: float = 0.0
-    opacity: tuple[float, float] = (0.3, 0.7)
     held_out_words: tuple[str, ...] = ("magenta", "yellow")
     plain: float = 0.2
     described: float = 0.25
     taught: int = 80
     learned: float = 0.5
-    start: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """Every field, as training.json keeps it."""
@@ -111,13 +107,10 @@ RECIPES: dict[str, Recipe] = {
         chunk=32,
         execute=10,
     ),
-    # Two-colour commands, taught to the policy that acts in the suite without them.
     "shared-pair": Recipe(
         suite="shared-pair",
         held_out_category="slipper",
-        start="mini-pi0-tabletop-longer",
-        stages=20,
-        steps=700,
+        stages=240,
         batch=32,
         rate=1e-3,
         angle_noise_rad=0.04,

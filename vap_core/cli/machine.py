@@ -461,14 +461,6 @@ def policy(
             "checkpoint's folder, trained first."
         ),
     ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(
-            help="A trained mini-pi0 of the suite whose weights it begins with; --vlm is then the "
-            "model that learned words are taught in. Default the recipe's, which for the four "
-            "benchmarks is none."
-        ),
-    ] = None,
     demonstrations: Annotated[
         Path | None,
         typer.Option(
@@ -522,11 +514,10 @@ def policy(
         steps=steps or standard.steps,
         batch=batch or standard.batch,
         rate=standard.rate if rate is None else rate,
-        start=standard.start if start is None else str(start),
     )
     rendered = cache or CACHE
     grows_from = vlm
-    if vlm is None and not recipe.start:
+    if vlm is None:
         model = folder.parent / "mini-paligemma"
         require_startable(
             recipe, folder, model, demonstrations=demonstrations, cache=rendered, device=device

@@ -263,10 +263,10 @@ def eval_policy(
     ways: Annotated[
         str,
         typer.Option(
-            help="How the target is named, with commas: tinted, painted, described, plain; "
-            "tinted-magenta, tinted-0.3 or tinted-yellow-0.7 force the colour and the opacity."
+            help="How the target is named, with commas: tinted; coloured, of a dyed target; "
+            "described; plain."
         ),
-    ] = "tinted,painted,described,plain",
+    ] = "tinted,coloured,described,plain",
     workers: Workers = 2,
     out: Annotated[
         Path | None,
@@ -277,10 +277,10 @@ def eval_policy(
     ] = None,
 ) -> None:
     """Measure what a policy can do with generic objects that no film has shown, told by a tint, by
-    paint, by words, or not at all.
+    its real colour, by words, or not at all.
 
     Example: python -m vap_core measure policy --suite simpler-bridge --scenes 4
-    Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,tinted-magenta
+    Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,coloured
     """
     from vap_core.base.errors import BadStudy
     from vap_core.simulation import suites

@@ -171,7 +171,7 @@ def dye_some(
 ) -> list[ObjectModel]:
     """The objects, none of them dyed, one, or most, each in a hue that has a word of its own.
 
-    Raises: ValueError where one that is not dyed has a colour to avoid, or a word has no dye.
+    Raises: ValueError where one has a colour to avoid.
     """
     words = rng.permutation([word for word in HUES_DEG if word not in avoid]).tolist()
     drawn, chances = rng.random(), rng.random(len(models))
@@ -182,7 +182,7 @@ def dye_some(
     chosen = []
     for model, chance in zip(models, chances, strict=True):
         if chance < MOST_DYED:
-            model = _dyed_as(words.pop(), model, rng, avoid)
+            model = dyed_as(words.pop(), model, rng)
         chosen.append(model)
     found = [shares(*_swatch(model)) for model in chosen]
     if any(of_model[word] > TRACE for of_model in found for word in avoid):
@@ -190,16 +190,13 @@ def dye_some(
     return chosen
 
 
-def _dyed_as(
-    word: str, model: ObjectModel, rng: np.random.Generator, avoid: Collection[str]
-) -> ObjectModel:
-    """The object with a dye that makes its materials be called by the word."""
+def dyed_as(word: str, model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+    """The object with a dye that its materials are called by; without one where none does it."""
     picture, whole = _swatch(model)
     for number in rng.permutation(np.arange(1, DYES)).tolist():
-        found = shares(draw_dye(number).on(picture), whole)
-        if found[word] >= MAIN and all(found[other] <= TRACE for other in avoid):
+        if shares(draw_dye(number).on(picture), whole)[word] >= MAIN:
             return dyed(model, number)
-    raise ValueError(f"dye_some: no dye makes {model.name} {word}; draw others")
+    return model
 
 
 @lru_cache(maxsize=8192)

@@ -126,7 +126,7 @@ def command(
     images = film.images[picture]
     if tints:
         owned = {things[i]: colour for i, colour in tints.items()}
-        images = tint_views(images, film.ids[picture], owned, recipe, rng)
+        images = tint_views(images, film.ids[picture], owned, rng)
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
     lit = np.clip(images * gain, 0, 255).astype(np.uint8)
     return Command(lit, text, form, tuple(things), tints, embedding)

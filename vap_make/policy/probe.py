@@ -6,7 +6,6 @@ colour that its materials are dyed with; a description of its own look; or nothi
 said, any of its kind is right, and what counts is whether the hand commits.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -19,10 +18,10 @@ import numpy as np
 
 from vap_core.base.errors import BadOutput, BadStudy, one_of
 from vap_core.base.files import make_folder, read_parquet, write_atomic
-from vap_core.base.types import Attended, Colour, Description, Rgb, value
+from vap_core.base.types import Attended, Colour, Description, Rgb
 from vap_core.policies.lerobot import adapter as lerobot
 from vap_core.policies.names import label_of
-from vap_core.prompt import ALPHA, PALETTE, tint
+from vap_core.prompt import PALETTE, tint
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import PromptContext, unchanged
 from vap_core.simulation.assets.objects import get_object
@@ -36,7 +35,7 @@ from vap_core.study.workers import results
 from vap_make.colours import HUES_DEG, stands_out
 from vap_make.films.captions import describe, distinguishes
 from vap_make.films.demonstrations import draw_models, row
-from vap_make.objects import DYES, dyed, material_colours
+from vap_make.objects import dyed_as, material_colours
 from vap_make.policy.commands import describe_instruction, phrase_instruction
 from vap_make.recipe import FILMED, RECIPES
 
@@ -44,8 +43,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 WAYS = ("tinted", "coloured", "described", "plain")
-DRAWS = 1000
-"""Dyes that are tried for one that stands out."""
 EACH = 4
 """Episodes of one scene, each run in every way."""
 ASKED = ["suite", "policy", "method"]
@@ -55,20 +52,8 @@ ProbeState = tuple[Colour, str]
 """The colour and the instruction of one episode."""
 
 
-@value
-class Tinting:
-    """What `tinted-COLOUR`, `tinted-OPACITY` or `tinted-COLOUR-OPACITY` force, whatever fits the
-    scene; a colour of None is drawn among those that no rival has."""
-
-    colour: Colour | None = None
-    alpha: float = ALPHA
-
-
 class ProbePrompter:
-    """Says which object is meant; "tinted" tints it by ground-truth masks at every step.
-
-    Raises: UnknownName, as `parse_way`.
-    """
+    """Says which object is meant; "tinted" tints it by ground-truth masks at every step."""
 
     needs_truth: Literal["never", "start", "always"] = "always"
     highlights = False
@@ -76,7 +61,7 @@ class ProbePrompter:
     references: Mapping[str, tuple[Rgb, ...]] = MappingProxyType({})
 
     def __init__(self, way: str) -> None:
-        self.way, self.tinting = parse_way(way)
+        self.way = way
 
     def start(
         self, observation: Observation, context: PromptContext
@@ -85,7 +70,7 @@ class ProbePrompter:
         row = context.truth.row
         rng = np.random.default_rng([79, row.seed, row.episode])
         described = _described(tuple(_same_kind(row)))
-        colour = self.tinting.colour or _draw_tint(row, rng)
+        colour = _draw_tint(row, rng)
         length = _length(described, rng)  # Drawn in every way, so that all ways draw alike.
         task = suite(row.suite).task(row.task)
         if self.way == "plain":
@@ -119,26 +104,8 @@ class ProbePrompter:
         for camera, rgb in observation.images.items():
             mask = context.truth.masks[camera].get(context.truth.row.target)
             if mask is not None and self.way == "tinted":
-                images[camera] = tint(rgb, mask, colour, self.tinting.alpha)
+                images[camera] = tint(rgb, mask, colour)
         return unchanged(images, text)
-
-
-def parse_way(way: str) -> tuple[str, Tinting]:
-    """One of WAYS, and what its further words force. Raises: UnknownName."""
-    name, *forced = way.split("-")
-    tinting = Tinting()
-    colours = {colour.name: colour for colour in PALETTE}
-    known = (*WAYS, *(f"tinted-{colour}" for colour in colours), "tinted-0.3")
-    if name not in WAYS or (forced and name != "tinted"):
-        raise one_of("probe: way", way, known)
-    for word in forced:
-        if word in colours:
-            tinting = replace(tinting, colour=colours[word])
-        elif re.fullmatch(r"0?\.\d+|1(\.0*)?", word):
-            tinting = replace(tinting, alpha=float(word))
-        else:
-            raise one_of("probe: way", way, known)
-    return name, tinting
 
 
 def probe(
@@ -171,7 +138,8 @@ def probe(
     if not ways:
         raise BadStudy("measure policy: there is no way to ask; name one by --ways.")
     for way in ways:
-        parse_way(way)
+        if way not in WAYS:
+            raise one_of("probe: way", way, WAYS)
     work = partial(_scene, checkpoint, suite_name, tuple(ways), execute, seed)
     done = tqdm(
         results(work=work, jobs=range(scenes), workers=workers, remedy="--workers"),
@@ -317,15 +285,12 @@ def _draw_tint(row: EpisodeRow, rng: np.random.Generator) -> Colour:
 def _with_dyed_target(row: EpisodeRow) -> EpisodeRow:
     """The episode with its target dyed in a colour that no rival shows."""
     rng = np.random.default_rng([77, row.seed, row.episode])
-    rivals, target = _rivals_show(row), get_object(row.target)
-    for _ in range(DRAWS):
-        name = dyed(target, int(rng.integers(1, DYES))).name
-        word, _ = material_colours(name)
-        usual = word in HUES_DEG and word not in RECIPES[row.suite].held_out_words
-        if usual and stands_out(word, rivals):
-            break
+    rivals = _rivals_show(row)
+    left_out = RECIPES[row.suite].held_out_words
+    words = [word for word in HUES_DEG if word not in left_out and stands_out(word, rivals)]
+    model = dyed_as(str(rng.choice(words or list(HUES_DEG))), get_object(row.target), rng)
     first, *others = row.placements
-    return replace(row, placements=(replace(first, model=name), *others))
+    return replace(row, placements=(replace(first, model=model.name), *others))
 
 
 @cache

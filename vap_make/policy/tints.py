@@ -6,9 +6,8 @@ equal odds for every object that may be meant and for none.
 
 from collections.abc import Mapping, Sequence
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from vap_core.base.types import Colour
 from vap_core.prompt import tint
@@ -42,33 +41,14 @@ def tint_views(
     images: Images,
     ids: UInt8[np.ndarray, "c s s"],
     tints: Mapping[int, Colour],
-    recipe: Recipe,
     rng: np.random.Generator,
 ) -> Images:
-    """The views with tints where `ids` is i + 1, as VAP does it with a tracker's masks."""
+    """The views with tints where `ids` is i + 1, as VAP does it; now and then a view has none."""
     tinted = images.copy()
     for i, colour in tints.items():
-        alpha = float(rng.uniform(*recipe.opacity))
-        for view, mask in enumerate(_track(ids == i + 1, rng)):
-            tinted[view] = tint(tinted[view], mask, colour, alpha)
+        alpha = float(rng.uniform(0.3, 0.7))
+        kept = rng.random(len(images)) > LOST
+        kept[rng.integers(len(images))] = True
+        for view in np.flatnonzero(kept):
+            tinted[view] = tint(tinted[view], ids[view] == i + 1, colour, alpha)
     return tinted
-
-
-def roughen_mask(mask: Bool[np.ndarray, "s s"], rng: np.random.Generator) -> np.ndarray:
-    """A mask as a tracker draws it: now and then a little off, swollen or shrunk."""
-    kind = rng.random()
-    if kind < 0.5 or not mask.any():
-        return mask
-    if kind < 0.7:
-        return np.roll(mask, rng.integers(-2, 3, 2), axis=(0, 1))
-    change = cv2.dilate if kind < 0.85 else cv2.erode
-    return change(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-
-
-def _track(masks: Bool[np.ndarray, "c s s"], rng: np.random.Generator) -> np.ndarray:
-    """Masks as a tracker draws them, at least one view's."""
-    kept = rng.random(len(masks)) > LOST
-    kept[rng.integers(len(masks))] = True
-    return np.stack(
-        [roughen_mask(mask, rng) & bool(keep) for mask, keep in zip(masks, kept, strict=True)]
-    )

@@ -20,13 +20,12 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from vap_core.base.errors import BadOutput, device_name
+from vap_core.base.errors import BadOutput, BadPolicy, device_name
 from vap_core.base.files import (
     code_version,
     make_folder,
     parse_json,
     saving_tensors,
-    sha256_of,
     write_atomic,
     writing,
 )
@@ -50,19 +49,12 @@ from vap_make.policy.ahead import Ahead
 from vap_make.policy.batches import Frames, statistics
 from vap_make.policy.commands import Known, nameable
 from vap_make.policy.losses import Learner, embedding_cosine, losses
-from vap_make.policy.start import (
-    initialise_policy,
-    read_start,
-    require_alike,
-    require_shared_words,
-    sizes_of,
-    start_folder,
-)
 from vap_make.policy.taught import learn_words, require_words_of
 from vap_make.recipe import Recipe, filmed_tasks
 from vap_make.step import Figures, Schedule, average_of, begun_with, train_steps
 
 FILMS = "films"
+SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned.
 
@@ -193,17 +185,15 @@ def train(
     """Train, or go on where an earlier call stopped, and write a checkpoint that lerobot loads.
 
     Returns training.json: the recipe, what was measured on the films held out, and the cost. The
-    policy goes on from the recipe's `start`; without one it grows from the mini-PaliGemma in `vlm`,
-    or, None, begins with nothing. Learned words are taught in `vlm`, from which the start must have
-    grown; None: none are. `demonstrations` is a dataset of train demonstrations, whose number of
+    policy grows from the mini-PaliGemma in `vlm`, in which learned words are taught, or, None,
+    begins with nothing. `demonstrations` is a dataset of train demonstrations, whose number of
     stages takes the place of the recipe's; None: the cache.
     The steps run on `device` (`base.device`); `jobs` processes, None: one a core, film, photograph,
     teach the words and draw the batches.
 
     Raises: BadOutput when `out` holds another training or a model without what it would go on from,
         another process trains there, or it or `cache` cannot be written or is damaged; BadPolicy
-        for a start that is no mini-pi0, or one of other cameras or sizes, or of another
-        mini-PaliGemma, or whose words are no longer that one's; UnknownName: no such device.
+        for a mini-PaliGemma of other words or sizes; UnknownName: no such device.
     """
     place = torch.device(device_name(device))
     made_of: dict[str, Any] = {}
@@ -216,13 +206,6 @@ def train(
         jobs = jobs or os.cpu_count() or 1
         # Before the films, which take longest.
         teacher = None if vlm is None else load_vlm(vlm)
-        start = None
-        if recipe.start:
-            start = read_start(start_folder(recipe.start), teacher, recipe.seed)
-            # But for the sizes of states and actions, which films tell.
-            require_alike(start, configuration(recipe, *sizes_of(start)))
-            if teacher is not None and recipe.taught:
-                require_shared_words(start, teacher)
         made_of["taught_in"] = _require_same_teacher(recipe, teacher, out)
         films = load_films(recipe, cache, demonstrations, jobs)
         if not films.train:
@@ -235,30 +218,18 @@ def train(
         made_of["data_sha256"] = data_sha256(films.all)
         first = films.train[0]
         config = configuration(recipe, first.state.shape[1], first.action.shape[1])
-        if start is not None:
-            require_alike(start, config)
-            learner = start.learner
-            stats = start.stats
-            config = learner.policy.config
-            config.n_action_steps, config.temperature = recipe.execute, TEMPERATURE
-            made_of["start"] = {
-                "name": recipe.start,
-                "sha256": sha256_of(start.folder / "model.safetensors"),
-            }
-        else:
-            stats = statistics(films.train, recipe.angle_noise_rad)
-            # Of initial weights only; every other draw comes from the step's stream.
-            torch.manual_seed(recipe.seed)
-            learner = Learner(config)
-            if teacher is not None:
-                config.vlm = teacher.sha256()
-                initialise_policy(teacher, learner.policy)
+        stats = statistics(films.train, recipe.angle_noise_rad)
+        # Of initial weights only; every other draw comes from the step's stream.
+        torch.manual_seed(recipe.seed)
+        learner = Learner(config)
+        if teacher is not None:
+            config.vlm = teacher.sha256()
+            initialise_policy(teacher, learner.policy)
         made_of["vlm"] = config.vlm
         cost_cpu_s: dict[str, float] = {}
         for part, spent_s in (("films", films.cpu_s), ("vlm", _vlm_cost_s(vlm))):
             if spent_s is not None:
                 cost_cpu_s[part] = spent_s
-        # After the start was checked: words take minutes.
         known, taught = _prepare_words(recipe, films, vlm, out, cost_cpu_s, jobs)
         frames = Frames(recipe=recipe, films=films.train, stats=stats, config=config, known=known)
         ahead = Ahead(frames, jobs)
@@ -370,9 +341,7 @@ def _require_same_teacher(recipe: Recipe, teacher: MiniVlm | None, out: Path) ->
     """
     sha256 = "" if teacher is None else teacher.sha256()
     taught_in = sha256 if recipe.taught else ""
-    known = {"taught_in": taught_in}
-    if not recipe.start:
-        known["vlm"] = sha256
+    known = {"taught_in": taught_in, "vlm": sha256}
     begun = begun_with(out)
     for name, given in known.items():
         if begun.get(name, given) != given:
@@ -470,3 +439,18 @@ def _shows_held_out(what: str) -> BadOutput:
         f"train policy: the films show {what}; film them again: python -m vap_core train "
         "demonstrations."
     )
+
+
+def initialise_policy(vlm: MiniVlm, policy: Any) -> None:
+    """Start a policy's image tower, decoder and words from the model's.
+
+    Raises: BadPolicy when words or sizes differ.
+    """
+    for name in ("words", *SIZES):
+        if getattr(policy.config, name) != getattr(vlm.config, name):
+            raise BadPolicy(
+                f"vlm.initialise_policy: policy and mini-PaliGemma differ in {name}; make the "
+                "model again: python -m vap_core train vlm"
+            )
+    paligemma = policy.model.paligemma_with_expert.paligemma
+    paligemma.load_state_dict(vlm.towers.paligemma.state_dict())
