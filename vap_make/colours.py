@@ -80,14 +80,14 @@ def seen(views: Sequence[Rgb], masks: Sequence[Mask]) -> tuple[str, frozenset[st
                 total[word] += share * int(mask.sum()) / pixels
     main = max(total, key=total.__getitem__)
     shown = frozenset(word for word, share in total.items() if share >= SHOWN)
-    return (main if total[main] >= MAIN else ""), shown
+    return main if total[main] >= MAIN else "", shown
 
 
 @cache
 def similar(word: str) -> frozenset[str]:
     """The word, and those that it may be taken for."""
     backwards = {colour for colour, near in NEAR.items() if word in near}
-    return frozenset({word} | NEAR.get(word, set()) | backwards)
+    return frozenset({word, *NEAR.get(word, ()), *backwards})
 
 
 def stands_out(word: str, others: Iterable[frozenset[str]]) -> bool:
