@@ -15,13 +15,13 @@ from safetensors.torch import load_file
 from tests.command import refused, vap
 from tests.deaths import die_before_each_rename
 from tests.random_kills import kill_in, serving
-from vap_core.base.errors import BadOutput, BadPolicy
-from vap_core.base.files import DATA, SHIPPED, sha256_of
+from vap_core.base.errors import BadOutput
+from vap_core.base.files import DATA, SHIPPED
 from vap_core.base.types import Description
 from vap_core.policies.lerobot.adapter import load_policy
 from vap_core.policies.lerobot.checkpoints import fingerprint
 from vap_core.policies.mini_pi0.learned_token import TokenTraining
-from vap_core.policies.mini_pi0.vlm import MiniVlm, load_from_policy, load_vlm
+from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_make.films import demonstrations
 from vap_make.films.dataset import data_sha256
 from vap_make.films.demonstrations import Film, cached
@@ -127,59 +127,6 @@ def test_a_vision_language_model_learns_and_resumes(
     begun = policy.train(replace(grown, steps=1), tmp_path / "begun", **options)
     assert about["taught"]
     assert not begun["taught"], "without a model there is nothing to learn a word in"
-
-
-def test_a_training_goes_on_from_another_policys_weights(
-    stage: tuple[Path, list[Film]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its image tower stays what the first training made of the mini-PaliGemma's."""
-    folder, films = stage
-    monkeypatch.setattr(demonstrations, "EPISODES", 2)
-    short = replace(TINY, stages=1, steps=2, batch=2, draws=1, taught=0)
-    config = policy.configuration(short, films[0].state.shape[1], films[0].action.shape[1])
-    for name in ("grown-from", "another"):
-        MiniVlm(config).save(tmp_path / name)
-
-    def train(out: str, vlm: str, **changes: object) -> dict[str, object]:
-        recipe = replace(short, **changes)
-        return policy.train(recipe, tmp_path / out, vlm=tmp_path / vlm, cache=folder.parent, jobs=1)
-
-    train("first", "grown-from", rate=1.0)
-    about = train("second", "grown-from", start=str(tmp_path / "first"), rate=0.0)
-    first, second = (load_file(tmp_path / out / "model.safetensors") for out in ("first", "second"))
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    towers = load_vlm(tmp_path / "grown-from").towers.state_dict()
-    learned = load_from_policy(tmp_path / "first").towers.state_dict()
-    assert max((towers[name] - learned[name]).abs().max() for name in towers) > 2e-3, "they differ"
-    assert about["start"]["sha256"] == sha256_of(tmp_path / "first" / "model.safetensors")
-    with pytest.raises(BadPolicy, match="did not grow from this mini-PaliGemma"):
-        train("third", "another", start=str(tmp_path / "first"))
-    with pytest.raises(BadPolicy, match="differs from the recipe in chunk_size"):
-        train("third", "grown-from", start=str(tmp_path / "first"), chunk=8)
-    with pytest.raises(BadPolicy, match="is no mini-pi0 to go on from"):
-        train("third", "grown-from", start=str(tmp_path / "grown-from"))
-
-
-@pytest.mark.parametrize("name", ["tabletop-longer", "shared-pair", f"{SUITE}-wide-seed-0"])
-def test_words_are_taught_where_they_mean_the_same(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def load_films(*asked: object) -> policy.Films:
-        return policy.Films([], [])
-
-    monkeypatch.setattr(policy, "load_films", load_films)
-    start = SHIPPED / f"mini-pi0-{name}"
-    model = SHIPPED / "mini-paligemma-tint-free"
-
-    def train(**changes: object) -> None:
-        settings = {"start": str(start), "taught": 80, **changes}
-        recipe = replace(
-            RECIPES[name.removesuffix("-wide-seed-0").removesuffix("-longer")], **settings
-        )
-        policy.train(recipe, tmp_path / str(changes), vlm=model, cache=tmp_path / "cache", jobs=1)
-
-    with pytest.raises(BadOutput, match="holds no film"):
-        train()
 
 
 def test_a_training_that_is_ended_again_and_again_ends_like_one_that_was_not(

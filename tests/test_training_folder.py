@@ -245,24 +245,21 @@ OTHER = "holds a training with another mini-PaliGemma, or with none; go on with 
 def test_a_training_goes_on_with_the_words_that_it_began_with(
     first: str, then: str, train_one: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The start's own model is the same either way, and its films are, too."""
-    train_one("start", "one")
-    start = str(tmp_path / "start")
-    begun = train_one("out", first, start=start)
+    begun = train_one("out", first)
     assert begun["taught_in"] == (load_vlm(tmp_path / "one").sha256() if first else "")
-    assert train_one("out", first, start=start)["trained_steps"] == 2
+    assert train_one("out", first)["trained_steps"] == 2
     with monkeypatch.context() as stopped:
         stopped.setattr(policy, "load_films", lambda *asked: pytest.fail("films were asked for"))
         with pytest.raises(BadOutput, match=OTHER):
-            train_one("out", then, start=start)
+            train_one("out", then)
     # As earlier code left it.
     state = torch.load(tmp_path / "out" / "training.pt", weights_only=True)
     made_of = json.loads(state["made_of"])
     del made_of["taught_in"]
     torch.save({**state, "made_of": json.dumps(made_of)}, tmp_path / "out" / "training.pt")
-    assert train_one("out", first, start=start)["trained_steps"] == 3
+    assert train_one("out", first)["trained_steps"] == 3
     with pytest.raises(BadOutput, match=OTHER):
-        train_one("out", then, start=start)
+        train_one("out", then)
 
 
 def test_words_of_another_model_are_found_before_the_work(
