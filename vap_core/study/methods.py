@@ -102,7 +102,7 @@ training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 """Colours that no shipped policy was trained with as tints.
 
-In its films things are painted in them (vap_make.words.PAINTS), and commands name them.
+The shipped ones' films had things painted in them, and commands named them.
 """
 
 
