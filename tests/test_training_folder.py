@@ -433,11 +433,11 @@ def test_an_error_of_drawing_is_no_lack_of_memory(
 
 
 SHOT = {
-    "simpler-bridge": 2180977730,
-    "simpler-fractal": 2855412502,
-    "vlabench": 1813732699,
-    "tabletop": 1040410494,
-    "shared-pair": 2897129562,
+    "simpler-bridge": 1271813716,
+    "simpler-fractal": 3117541481,
+    "vlabench": 274315801,
+    "tabletop": 3905308951,
+    "shared-pair": 864879599,
 }
 """A checksum of the first stage's look, objects and places, by suite."""
 
@@ -451,4 +451,4 @@ def test_films_that_change_are_kept_elsewhere(name: str) -> None:
     names = draw_objects(suite(name), task, rng)
     start = row(suite(name), task, names, 0, rng)
     shown = json.dumps([repr(look), names, repr(start.placements)])
-    assert (policy.FILMS, zlib.crc32(shown.encode())) == ("films", SHOT[name])
+    assert (policy.FILMS, zlib.crc32(shown.encode())) == ("dyed-films", SHOT[name])

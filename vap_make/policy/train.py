@@ -53,7 +53,7 @@ from vap_make.policy.taught import learn_words, require_words_of
 from vap_make.recipe import Recipe, filmed_tasks
 from vap_make.step import Figures, Schedule, average_of, begun_with, train_steps
 
-FILMS = "films"
+FILMS = "dyed-films"
 SIZES = ("image_resolution", "patch", "width", "depth", "head_dim", "vision_width", "vision_depth")
 HELD_OUT = 19
 """Every so many stages one is kept from training, to see what was learned.

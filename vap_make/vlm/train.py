@@ -42,7 +42,7 @@ from vap_make.recipe import Sizes
 from vap_make.step import Figures, Schedule, average_of, train_steps
 from vap_make.vlm.questions import Question, ask
 
-SCENES = "vlm"
+SCENES = "dyed-scenes"
 SEEN = 0.5
 """Weight of the patches beside the words."""
 OWN_STD, FASTER = 0.2, 30.0
