@@ -80,8 +80,9 @@ def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 def stage(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, list[Film]]":
     """A folder that keeps a stage of two episodes of simpler-bridge, and its films."""
     from vap_make.films import demonstrations
+    from vap_make.policy.train import FILMS
 
-    folder = tmp_path_factory.mktemp("cache") / "films"
+    folder = tmp_path_factory.mktemp("cache") / FILMS
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demonstrations, "EPISODES", 2)
         return folder, demonstrations.cached(folder, "simpler-bridge", 0, 1)

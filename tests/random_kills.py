@@ -65,9 +65,10 @@ def train_vlm(cache: Path, out: Path) -> None:
 
     from tests.test_policy_training import SUITE, vlm_inputs
     from vap_make.films.demonstrations import cached
+    from vap_make.policy.train import FILMS
     from vap_make.vlm import train as vlm
 
-    films = cache / "films"
+    films = cache / FILMS
     schedule = vlm.Schedule
     with pytest.MonkeyPatch.context() as patch:
         pool, recipe = vlm_inputs((films, cached(films, SUITE, 0, 1)), patch)
