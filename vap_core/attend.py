@@ -70,6 +70,9 @@ LEAST_COVER = 0.4
 OF_AGREEMENT = 0.7
 """How much of their likeness to each other the references lend to an object that is in view: where
 they are very alike, a look-alike is like them, too."""
+MOST_ASKED = 0.74
+"""No likeness above this is asked for: those of a thing that looks alike from all sides agree more
+than any view of it, from another camera in other light, agrees with them."""
 PerTarget = tuple[Grounding, ...]
 """One grounding per target of the instruction, in the order of its targets."""
 
@@ -372,7 +375,7 @@ class Attender:
         if thresholds.together is not None and k > 1 and found:
             rows = reference_rows(obj, self.stack.encoder)
             agreement = (float((rows @ rows.T).sum()) - k) / (k * (k - 1))
-            least = thresholds.together + OF_AGREEMENT * agreement
+            least = min(MOST_ASKED, thresholds.together + OF_AGREEMENT * agreement)
             if max(found) < least:
                 familiar = max(familiar, least)
         judged = {}

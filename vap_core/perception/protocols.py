@@ -155,7 +155,7 @@ class Thresholds:
 
     `together` is about all familiar views of an episode: the object is in none of them unless the
     best view's likeness, less `attend.OF_AGREEMENT` times the mean cosine among the references,
-    reaches it.
+    reaches it, or the likeness is `attend.MOST_ASKED`.
     """
 
     familiar: float
