@@ -105,16 +105,13 @@ def draw_objects(
     Target and rivals are generic and of the task's category; half the rivals are look-alikes, and
     most scenes have dyed objects. Those `held_out` are in no film.
     """
-    avoid = RECIPES[known.name].held_out_words
-    draw = pairs.draw_models if FILMED[known.name].pairs else partial(draw_models, known)
-    while True:
-        try:
-            models = dye_some(draw(task, rng, held_out), rng, avoid)
-        except ValueError:
-            continue
-        only_generic(models)
-        names = [model.name for model in models]
-        return [*names, task.goal] if task.goal and not FILMED[known.name].pairs else names
+    if FILMED[known.name].pairs:
+        draw, goals = pairs.draw_models, []
+    else:
+        draw, goals = partial(draw_models, known), [task.goal] * bool(task.goal)
+    models = dye_some(draw(task, rng, held_out), rng, RECIPES[known.name].held_out_words)
+    only_generic(models)
+    return [*(model.name for model in models), *goals]
 
 
 def draw_models(

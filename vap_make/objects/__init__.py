@@ -38,8 +38,8 @@ FAMILY_NUMBERS: dict[str, int] = {family.stem: i for i, family in enumerate(FAMI
 """Seeds depend on these numbers."""
 WHOLE, SOAKED = 0.75, (0.35, 0.9)
 """Share of dyed objects that are dyed all around, and how much dye their materials take."""
-UNDYED, ONE_DYED, MOST_DYED = 0.1, 0.25, 0.9
-"""Shares of scenes in which nothing is dyed, and one object; and how many objects of the others."""
+HOW_MANY, MOST_DYED = (0.1, 0.25, 0.65), 0.9
+"""Shares of scenes in which nothing is dyed, one object, or each with that chance."""
 TRACE = 0.03
 """Share of materials from which they have a colour that was to be avoided."""
 DYES = 1_000
@@ -171,32 +171,35 @@ def dye_some(
 ) -> list[ObjectModel]:
     """The objects, none of them dyed, one, or most, each in a hue that has a word of its own.
 
-    Raises: ValueError where one has a colour to avoid.
+    One whose own materials have a colour to avoid is dyed in any case.
     """
     words = rng.permutation([word for word in HUES_DEG if word not in avoid]).tolist()
-    drawn, chances = rng.random(), rng.random(len(models))
-    if drawn < UNDYED:
-        chances[:] = 1.0
-    elif drawn < UNDYED + ONE_DYED:
-        chances = np.where(chances == chances.min(), 0.0, 1.0)
+    most = rng.binomial(len(models), MOST_DYED)
+    n = rng.choice([0, 1, most], p=HOW_MANY)
+    marked = rng.permutation(len(models))[:n]
     chosen = []
-    for model, chance in zip(models, chances, strict=True):
-        if chance < MOST_DYED:
-            model = dyed_as(words.pop(), model, rng)
+    for i, model in enumerate(models):
+        if i in marked or _has(shares(*_swatch(model)), avoid):
+            model = dyed_as(words.pop(), model, rng, avoid)
         chosen.append(model)
-    found = [shares(*_swatch(model)) for model in chosen]
-    if any(of_model[word] > TRACE for of_model in found for word in avoid):
-        raise ValueError("dye_some: an object has a colour to avoid; draw others")
     return chosen
 
 
-def dyed_as(word: str, model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+def dyed_as(
+    word: str, model: ObjectModel, rng: np.random.Generator, avoid: Collection[str] = ()
+) -> ObjectModel:
     """The object with a dye that its materials are called by; without one where none does it."""
     picture, whole = _swatch(model)
     for number in rng.permutation(np.arange(1, DYES)).tolist():
-        if shares(draw_dye(number).on(picture), whole)[word] >= MAIN:
+        found = shares(draw_dye(number).on(picture), whole)
+        if found[word] >= MAIN and not _has(found, avoid):
             return dyed(model, number)
     return model
+
+
+def _has(found: Mapping[str, float], words: Collection[str]) -> bool:
+    """Whether there is a trace of one of the colours."""
+    return any(found[word] > TRACE for word in words)
 
 
 @lru_cache(maxsize=8192)
