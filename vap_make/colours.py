@@ -50,8 +50,8 @@ NEAR = {
 
 def shares(rgb: Rgb, mask: Mask) -> dict[str, float]:
     """The share of the object's pixels that have each of `WORDS`; the mask has one."""
-    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    rows, columns = mask.any(axis=1), mask.any(axis=0)
+    box = np.ix_(rows, columns)
     rgb, mask = rgb[box], mask[box]
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[mask]
     index = colour_indices(rgb, mask)[mask]
@@ -73,11 +73,11 @@ def seen(views: Sequence[Rgb], masks: Sequence[Mask]) -> tuple[str, frozenset[st
     Its pixels of all views count together.
     """
     total = dict.fromkeys(WORDS, 0.0)
-    pixels = sum(int(mask.sum()) for mask in masks)
+    pixels = sum(mask.sum() for mask in masks)
     for rgb, mask in zip(views, masks, strict=True):
         if mask.any():
             for word, share in shares(rgb, mask).items():
-                total[word] += share * int(mask.sum()) / pixels
+                total[word] += share * mask.sum() / pixels
     main = max(total, key=total.__getitem__)
     shown = frozenset(word for word, share in total.items() if share >= SHOWN)
     return main if total[main] >= MAIN else "", shown

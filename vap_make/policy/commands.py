@@ -71,9 +71,13 @@ class Command:
 
 
 def colours_of(film: Film) -> list[Seen]:
-    """The colours of every object of a film, seen in its first pictures."""
-    views = list(film.images[0])
-    return [seen(views, list(film.ids[0] == i + 1)) for i in range(len(film.names))]
+    """The colours of every object of a film, from the pictures that show the most of it."""
+    found = []
+    for i in range(len(film.names)):
+        masks = film.ids == i + 1
+        best = masks.sum(axis=(1, 2, 3)).argmax()
+        found.append(seen(list(film.images[best]), list(masks[best])))
+    return found
 
 
 def command(
@@ -94,10 +98,9 @@ def command(
     pairs = FILMED[recipe.suite].pairs
     things = nameable(film, recipe.suite)
     names = [film.names[i] for i in things]
-    caption = known.captions[names[0]]
     length: Literal["short", "long"] = "long" if rng.random() < 0.5 else "short"
     words, shown = map(list, zip(*(colours[i] for i in things), strict=True))
-    tints = draw_tints(shown, recipe, rng, at_once=2 if pairs else 1)
+    tints = draw_tints(len(things), recipe, rng, at_once=2 if pairs else 1)
     for i, colour in tints.items():
         words[i] = colour.name
         shown[i] |= {colour.name}
@@ -112,9 +115,11 @@ def command(
         if pairs:
             text = phrase_pair(task, words[0], words[-1])
     elif form == "described":
-        if pairs or not distinguishes(known.captions, names, length):
+        phrase = getattr(known.captions[names[0]], length)
+        held_out = any(word in phrase for word in recipe.held_out_words)
+        if pairs or held_out or not distinguishes(known.captions, names, length):
             return None
-        text = describe_instruction(task, getattr(caption, length))
+        text = describe_instruction(task, phrase)
     elif form == "learned":
         text = soft_prompt(WORD, [task.category]).rewrite(task.instruction)
         embedding = known.learned[names[0]]

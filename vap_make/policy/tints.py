@@ -4,14 +4,13 @@ Whether a scene is tinted, and which objects carry the tints, is drawn before an
 equal odds for every object that may be meant and for none.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import UInt8
 
 from vap_core.base.types import Colour
 from vap_core.prompt import tint
-from vap_make.colours import stands_out
 from vap_make.recipe import TINTS, Recipe
 
 LOST = 0.12
@@ -21,19 +20,18 @@ Images = UInt8[np.ndarray, "c s s 3"]
 
 
 def draw_tints(
-    shown: Sequence[frozenset[str]], recipe: Recipe, rng: np.random.Generator, at_once: int = 1
+    n: int, recipe: Recipe, rng: np.random.Generator, at_once: int = 1
 ) -> dict[int, Colour]:
-    """The tint of each object that carries one, of `at_once` at most; `shown` are their colours."""
+    """The tint of each of `n` objects that carries one, `at_once` at most."""
     tints: dict[int, Colour] = {}
     if rng.random() >= recipe.tint_share:
         return tints
     for _ in range(at_once):
-        carrier = int(rng.integers(len(shown) + 1)) - 1
+        carrier = int(rng.integers(n + 1)) - 1
         if carrier < 0 or carrier in tints:
             continue
         left = [colour for colour in TINTS if colour not in tints.values()]
-        clear = [colour for colour in left if stands_out(colour.name, shown)] or left
-        tints[carrier] = clear[int(rng.integers(len(clear)))]
+        tints[carrier] = left[rng.integers(len(left))]
     return tints
 
 
