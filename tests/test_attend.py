@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.toys import TOYS, SameColour, overhead, personal, scene, unchecked
 from vap_core.associate import compare_views
-from vap_core.attend import MOST_ASKED, Attender, Prompting
+from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadInstruction, BadStudy, BadViews, UnknownName
 from vap_core.base.events import is_lost
 from vap_core.base.types import Attended, Boxes, Colour, Grounding, Rgb, Views
@@ -308,27 +308,6 @@ def test_every_colour_that_is_named_is_visible(
     stack = TOYS if unlike else replace(TOYS, thresholds=Thresholds(0.999, 0.999))
     _, attended = Attender(stack, ALIKE if alike else MEMORY).start(views, text)
     assert not unseen_colours(attended, views)
-
-
-@pytest.mark.parametrize(
-    ("seen", "others", "is_there"),
-    [
-        ((150, 100, 60), (), True),  # likeness .77
-        ((200, 110, 60), (), False),  # .70
-        ((200, 110, 60), ((200, 60, 20),), True),  # what has two sides is less alike from each
-    ],
-)
-def test_references_that_agree_ask_for_more_but_not_for_their_own_agreement(
-    seen: tuple[int, int, int], others: tuple[tuple[int, int, int], ...], is_there: bool
-) -> None:
-    """Equal photos of a pen holder once asked for .87 of every view, which renders do not reach."""
-    teal = (40, 120, 110)
-    memory = {"mug": personal("mug", "cup", teal, *(others or [teal]))}
-    stack = replace(TOYS, thresholds=Thresholds(0.5, 0.54, together=0.165))
-    _, attended = Attender(stack, memory).start({"front": scene([(4, 20, seen)])}, "bring my cup")
-    (grounding,) = attended.groundings["front"]
-    assert (grounding.winner is not None) == is_there
-    assert grounding.threshold == (0.5 if is_there else MOST_ASKED)
 
 
 def test_mirrored_views_mirror_the_answer() -> None:

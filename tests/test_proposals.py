@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.toys import TOYS, MeanColour, detector, overhead, personal, scene
-from vap_core.attend import Attender, Prompting
+from vap_core.attend import MOST_ASKED, Attender, Prompting
 from vap_core.base.types import Boxes, Rgb
 from vap_core.memory import load, reference_box, register, save
 from vap_core.perception.boxes import box_cover
@@ -167,6 +167,27 @@ def test_an_object_is_in_no_view_unless_one_is_as_like_it_as_its_photos_are_alik
     assert winners(0.28, shown, always_tint=True) == [0, 0]
     assert winners(0.28, shown, references=1) == [0, 0]  # one photo is alike to none
     assert winners(0.28, {**shown, "side": scene([(4, 20, TEAL)])}) == [0, 0]  # seen in one view
+
+
+@pytest.mark.parametrize(
+    ("seen", "others", "is_there"),
+    [
+        ((150, 100, 60), (), True),  # likeness .77
+        ((200, 110, 60), (), False),  # .70
+        ((200, 110, 60), ((200, 60, 20),), True),  # what has two sides is less alike from each
+    ],
+)
+def test_references_that_agree_ask_for_more_but_not_for_their_own_agreement(
+    seen: tuple[int, int, int], others: tuple[tuple[int, int, int], ...], is_there: bool
+) -> None:
+    """Equal photos of a pen holder once asked for .87 of every view, which renders do not reach."""
+    teal = (40, 120, 110)
+    memory = {"mug": personal("mug", "cup", teal, *(others or [teal]))}
+    stack = replace(TOYS, thresholds=Thresholds(0.5, 0.54, together=0.165))
+    _, attended = Attender(stack, memory).start({"front": scene([(4, 20, seen)])}, "bring my cup")
+    (grounding,) = attended.groundings["front"]
+    assert (grounding.winner is not None) == is_there
+    assert grounding.threshold == (0.5 if is_there else MOST_ASKED)
 
 
 def test_recordings_and_signals_say_not_in_view() -> None:

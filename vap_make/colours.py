@@ -1,6 +1,6 @@
 """Colour words of what is seen: judged on an object's rendered pixels, by hue in CIE Lab.
 
-    word, shown = seen(rgb, mask)
+    word, shown = seen([rgb], [mask])
 
 It is no test of a tint, which goes by HSV (`prompt.has_colour`).
 """

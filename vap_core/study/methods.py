@@ -100,10 +100,8 @@ TINT_SHARES = {
 """Policies of one recipe, of the same films, seed and mini-PaliGemma, by the share of their
 training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
-"""Colours that no shipped policy was trained with as tints.
-
-The shipped ones' films had things painted in them, and commands named them.
-"""
+"""Colours that no shipped policy was trained with as tints; in their films things were painted in
+them, and commands named them."""
 
 
 def _tints() -> dict[str, Arm]:
