@@ -79,6 +79,10 @@ class BadInstruction(VapError):
     """An instruction without a personal object, or with more of them than the palette has tints."""
 
 
+class NothingPersonal(BadInstruction):
+    """An instruction that names no personal object."""
+
+
 class UnknownName(VapError):
     """A suite, task, object, category, robot, method, policy or stack that no registry holds.
 
@@ -162,7 +166,11 @@ class BadPlan(BadPolicy):
 
 
 class BadEndpoint(VapError):
-    """A chat endpoint that cannot be reached, refuses, or does not follow the protocol."""
+    """A chat endpoint or policy server that cannot be reached, refuses, or breaks the protocol."""
+
+
+class BadMessage(VapError):
+    """A message of a policy server, or of its client, that is damaged or lacks what it needs."""
 
 
 class BadCluster(VapError):

@@ -17,7 +17,7 @@ import typer
 
 from vap_core.base import errors
 from vap_core.base.errors import BadOutput, VapError, missing_part, printable
-from vap_core.cli import bench, look, machine, measure, own, run
+from vap_core.cli import bench, look, machine, measure, own, run, serve
 
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
 worked or failed.
@@ -34,7 +34,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help=HELP,
 )
-for module in (run, look, own, machine, bench):
+for module in (run, look, own, serve, machine, bench):
     app.add_typer(module.app)
 app.add_typer(measure.app, name="measure")
 

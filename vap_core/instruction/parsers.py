@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from vap_core.base.errors import BadEndpoint, BadInstruction, UnknownName
+from vap_core.base.errors import BadEndpoint, NothingPersonal, UnknownName
 from vap_core.base.files import parse_json
 from vap_core.base.types import Instruction, PersonalObject, Target, value
 from vap_core.instruction.context import Context, owners_of, read_uses
@@ -129,7 +129,8 @@ class ChatParser:
         """Parse one instruction; every target names its object.
 
         Raises: BadEndpoint: the server cannot be reached, takes too long, refuses, or its answer is
-            malformed; BadInstruction: the model finds no personal object, or the text is too long.
+            malformed; NothingPersonal: the model finds no personal object; BadInstruction: the text
+            is too long.
         """
         check_length(text)
         answer = request_answer(
@@ -143,7 +144,7 @@ class ChatParser:
         )
         targets = self._targets(text, answer)
         if not targets:
-            raise BadInstruction(
+            raise NothingPersonal(
                 f"parse: {self.endpoint.model} finds no personal object in {text[:80]!r}; name one "
                 'as "my <category>".'
             )

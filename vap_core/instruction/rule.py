@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Protocol, runtime_checkable
 
-from vap_core.base.errors import BadInstruction
+from vap_core.base.errors import BadInstruction, NothingPersonal
 from vap_core.base.types import Colour, Instruction, Target
 
 STOP_WORDS = frozenset(
@@ -57,7 +57,7 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
     article of "the neighbour's <category>" is part of the span.
 
     Raises:
-        BadInstruction: the text holds no possessive span, or is too long.
+        NothingPersonal: the text holds no possessive span; BadInstruction: it is too long.
     """
     check_length(text)
     targets: list[Target] = []
@@ -80,7 +80,7 @@ def parse(text: str, categories: Collection[str] = (), owners: Collection[str] =
             targets.append(Target(start=start, stop=stop, owner=owner, category=category))
         trigger = pattern.search(text, stop)
     if not targets:
-        raise BadInstruction(
+        raise NothingPersonal(
             f'parse: no personal object in {text!r}; name one as "my <category>", '
             'for example "bring my cup".'
         )

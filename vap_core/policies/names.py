@@ -47,6 +47,11 @@ def label_of(checkpoint: str | Path, temperature: float | None = None) -> str:
     return label if temperature is None else f"{label}{TEMPERATURE}{temperature:g}"
 
 
+def is_served(name: str) -> bool:
+    """Whether a policy's name is the address of a policy server (policies.served)."""
+    return name.startswith(("ws://", "wss://"))
+
+
 def checkpoint_of(label: str) -> str:
     """The folder's name in a `policy_label`; nothing for a policy without weights."""
     return label.partition(":")[2].rpartition("@")[0]
@@ -58,9 +63,9 @@ def shipped_checkpoint(benchmark: str) -> Path:
 
 
 def check_policy_name(name: str) -> None:
-    """Raises: UnknownName: neither a policy nor what could name a lerobot checkpoint."""
+    """Raises: UnknownName: no policy, no server's address, and no lerobot checkpoint's name."""
     from vap_core.policies.lerobot.checkpoints import is_checkpoint_name
 
     known = (*POLICIES, MINI)
-    if name not in known and not is_checkpoint_name(name):
-        raise one_of("Study: policy (or a lerobot checkpoint's folder or hub id)", name, known)
+    if name not in known and not is_served(name) and not is_checkpoint_name(name):
+        raise one_of("Study: policy (or a checkpoint's folder or hub id, or ws://...)", name, known)

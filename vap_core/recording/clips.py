@@ -1,18 +1,29 @@
 """Recordings for `vap_core ground`: of one picture, and of a clip."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from vap_core.base.types import Attended, Grounding, PersonalObject, Rgb, Track, Views, value
+from vap_core.base.types import (
+    Attended,
+    Event,
+    Grounding,
+    PersonalObject,
+    Rgb,
+    Track,
+    Views,
+    value,
+)
 from vap_core.recording.colours import image_root
+from vap_core.recording.entities.curves import send_events
 from vap_core.recording.entities.pictures import CLASSES, encode_jpeg, jpeg_image, track_image
 from vap_core.recording.entities.votes import log_vote, log_vote_picture
 from vap_core.recording.layout import (
     Part,
+    events_view,
     full_window,
     grounding_blueprint,
     instruction_view,
@@ -130,17 +141,22 @@ def log_clip_step(rec: rr.RecordingStream, camera: str, step: ClipStep) -> None:
 class DatasetRecorder:
     """Streams the frames of an episode to disk; `ground` adds the votes that began the tracks.
 
+    `served`: of an episode behind the proxy, which has actions and events.
+
     Left through an exception, the unfinished file keeps its temporary name.
 
     Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
 
-    def __init__(self, path: Path, cameras: Sequence[str], name: str, hz: float) -> None:
+    def __init__(
+        self, path: Path, cameras: Sequence[str], name: str, hz: float, *, served: bool = False
+    ) -> None:
         self.path = path
         self._rec = open_stream(path, f"dataset.{name}.{path.stem}")
         self._rec.send_recording_name(f"{path.stem} · {name}")
         log_row(self._rec, "/", rr.AnnotationContext(CLASSES))
-        dataset_blueprint(cameras, hz).send(self._rec)
+        further = [events_view(), rrb.TimeSeriesView(origin="/action", name="action")]
+        dataset_blueprint(cameras, hz, further if served else ()).send(self._rec)
 
     def __enter__(self) -> "DatasetRecorder":
         return self
@@ -163,6 +179,18 @@ class DatasetRecorder:
             )
             log_clip_step(self._rec, camera, step)
 
+    def add_numbers(
+        self,
+        frame_index: int,
+        at_s: float,
+        numbers: Mapping[str, np.ndarray],
+        told: Sequence[Event],
+    ) -> None:
+        """Rows of numbers of a frame by entity, as /action, and its events."""
+        for entity, row in numbers.items():
+            log_row(self._rec, entity, rr.Scalars(row), at=time_columns([(frame_index, at_s)]))
+        send_events(self._rec, told, {frame_index: at_s})
+
     def ground(self, views: Views, attended: Attended, obj: PersonalObject, told: str) -> None:
         """The votes of the first frame, and the references that voted."""
         at = time_columns([(0, 0.0)])
@@ -177,8 +205,11 @@ class DatasetRecorder:
                 log_row(self._rec, "/vap/instruction", document, at=at)
 
 
-def dataset_blueprint(cameras: Sequence[str], fps: float) -> StoredBlueprint:
-    """A recorded episode: per camera what a policy would see, the track and the vote."""
+def dataset_blueprint(
+    cameras: Sequence[str], fps: float, further: Sequence[Part] = ()
+) -> StoredBlueprint:
+    """A recorded episode: per camera what a policy would see, the track and the vote; and further
+    views below."""
     rows: list[Part] = []
     votes: list[Part] = []
     for camera in cameras:
@@ -188,6 +219,6 @@ def dataset_blueprint(cameras: Sequence[str], fps: float) -> StoredBlueprint:
         instruction_view(),
         track_score_view(),
         rrb.Tabs(*votes, active_tab=0),
-        column_shares=[1.2, 1.2, 1.2],
+        *further,
     )
     return full_window(rrb.Vertical(rrb.Horizontal(*rows), below, row_shares=[2, 1]), fps)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from vap_core.base.errors import BadPolicy, BadStudy, WorkerDied, number_of
 from vap_core.base.files import write_atomic, writing
 from vap_core.policies.lerobot.checkpoints import config_field, fingerprint, locate, stamp
-from vap_core.policies.names import MINI, POLICIES, shipped_checkpoint
+from vap_core.policies.names import MINI, POLICIES, is_served, shipped_checkpoint
 from vap_core.policies.protocol import unchanged_weights
 from vap_core.policies.tables import vocabulary_of, words_of
 from vap_core.rollout.types import Episode, EpisodeHeader
@@ -121,7 +121,9 @@ def worker_modules(policy: str) -> tuple[str, ...]:
         "onnxruntime",
         "scipy.special",
     ]
-    if policy not in POLICIES:
+    if is_served(policy):
+        modules += ["vap_core.policies.served", "websockets.sync.client"]
+    elif policy not in POLICIES:
         modules += ["vap_core.policies.lerobot.adapter", "lerobot.policies"]
         if Path(policy).name.startswith(MINI):
             modules.append("vap_core.policies.mini_pi0.processor_mini_pi0")

@@ -23,7 +23,13 @@ from vap_core.policies.names import MINI as MINI
 from vap_core.policies.names import POLICIES as POLICIES
 from vap_core.policies.names import PRIVILEGED as PRIVILEGED
 from vap_core.policies.names import SHIPPED as SHIPPED
-from vap_core.policies.names import check_policy_name, checkpoint_of, label_of, shipped_checkpoint
+from vap_core.policies.names import (
+    check_policy_name,
+    checkpoint_of,
+    is_served,
+    label_of,
+    shipped_checkpoint,
+)
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.scripted.scripted import Random, Scripted
@@ -175,11 +181,15 @@ class Study:
         """The folder or hub id of the policy's weights for a suite; "" where it has none."""
         if self.policy == MINI:
             return str(shipped(suite))
-        return "" if self.policy in POLICIES else self.policy
+        return "" if self.policy in POLICIES or is_served(self.policy) else self.policy
 
     def policy_label(self, suite: str) -> str:
         """What the rows of a suite call the policy. Raises: BadPolicy."""
         checkpoint = self.checkpoint(suite)
+        if is_served(self.policy):
+            from vap_core.policies.served import parse_address
+
+            return parse_address(self.policy).label
         return label_of(checkpoint, self.temperature) if checkpoint else self.policy
 
     def any_method(self, holds: Callable[[str], bool]) -> bool:
@@ -219,6 +229,8 @@ class Study:
             if not about[option]:
                 del about[option]
         del about["suite_files"]  # the lists' digests stand for them
+        if is_served(self.policy):
+            about["served"] = self.policy_label("")
         if names == [self.policy]:
             about["checkpoint"] = fingerprints[0]
         elif names:
@@ -260,7 +272,11 @@ def _check_names(study: Study) -> None:
 
 def _check_policy(study: Study) -> None:
     policy = study.policy
-    if policy not in POLICIES:
+    if is_served(policy):
+        from vap_core.policies.served import parse_address
+
+        parse_address(policy)
+    elif policy not in POLICIES:
         require("policy", f"the policy {policy}")
     for suite, _ in study.tasks:
         if policy == MINI and not shipped(suite).is_dir():
@@ -270,10 +286,10 @@ def _check_policy(study: Study) -> None:
                 f"train policy --suite {suites.benchmark_name(suite)}"
             )
     if study.temperature is not None:
-        if policy in POLICIES:
+        if policy in POLICIES or is_served(policy):
             raise BadStudy(
-                f"Study: policy {policy!r} samples nothing; leave --temperature out, or take "
-                f"--policy {MINI}."
+                f"Study: policy {policy!r} samples nothing that is set from here; leave "
+                f"--temperature out, or take --policy {MINI}."
             )
         if not 0 <= study.temperature <= HOTTEST:
             raise BadStudy(
@@ -301,7 +317,7 @@ def _check_policy(study: Study) -> None:
             f"Study: policy {policy!r} parses its command, and blank-text gives it none; leave "
             f"blank-text out, or take --policy {MINI}."
         )
-    if policy in POLICIES and study.any_method(needs_token):
+    if (policy in POLICIES or is_served(policy)) and study.any_method(needs_token):
         raise BadStudy(
             f"Study: policy {policy!r} has no words that could be learned; leave soft out, or take "
             f"--policy {MINI}."
@@ -427,6 +443,10 @@ def _policy(
     suite = suites.suite(row.suite)
     if study.policy in POLICIES:
         return make_policy(study.policy, scene, suite, stack)
+    if is_served(study.policy):
+        from vap_core.policies.served import served_for_suite
+
+        return served_for_suite(study.policy, scene, suite)
     from vap_core.policies.lerobot import adapter  # and torch
 
     policy = adapter.load_for_suite(
