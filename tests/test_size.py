@@ -12,10 +12,10 @@ from vap_core.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {
-    "= vap_core": {"files": 181, "nodes": 224_500, "functions": 2_545},
+    "= vap_core": {"files": 189, "nodes": 234_800, "functions": 2_670},
     "= vap_make": {"files": 65, "nodes": 74_900, "functions": 790},
 }
-COMMANDS, OPTIONS = 20, 215
+COMMANDS, OPTIONS = 21, 230
 
 
 COUNTED = ("files", "code", "nodes", "functions")

@@ -61,7 +61,9 @@ def test_a_temperature_is_a_setting_where_it_is_given() -> None:
         assert study_of({"configuration": study.configuration()}, row).temperature == (
             study.temperature
         )
-    with pytest.raises(BadStudy, match="samples nothing that is set from here; leave --temperature out"):
+    with pytest.raises(
+        BadStudy, match="samples nothing that is set from here; leave --temperature out"
+    ):
         replace(warm, policy="scripted")
     for wrong in (-0.1, 11.0, float("nan")):
         with pytest.raises(BadStudy, match="say a number from 0, no noise, to 10"):

@@ -131,6 +131,7 @@ def _policy_server(asked: AskedOfServe, wire: "Wire") -> "PolicyServer":
 
 def _proxy(asked: AskedOfServe, wire: "Wire", upstream: str) -> None:
     from vap_core.attend import Attender
+    from vap_core.base.errors import command
     from vap_core.memory import load_bank
     from vap_core.perception.stacks import load_stack
     from vap_core.policies.served import parse_address
@@ -155,7 +156,7 @@ def _proxy(asked: AskedOfServe, wire: "Wire", upstream: str) -> None:
     objects = ", ".join(bank) or "nothing"
     asyncio.run(_listen(asked, wire, proxy, f"a proxy before {url}; it remembers {objects}"))
     if asked.record is not None:
-        print(f"next: python -m vap_core query {asked.record} lost-track")
+        print("next: " + command("query", asked.record, "lost-track"))
 
 
 async def _listen(asked: AskedOfServe, wire: "Wire", handler: Any, what: str) -> None:

@@ -9,7 +9,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlsplit
@@ -92,7 +92,8 @@ class Connection:
         self._asked: deque[int] = deque()
         """The numbers of the requests that have no reply yet."""
         self._fault = ""
-        self._socket = _open(address.url)
+        self._opened = ExitStack()
+        self._socket = _open(address.url, self._opened)
         if address.wire.marks_episodes:
             self._asked.append(self._send("hello", {}))
         self.metadata: Mapping[Any, Any] = self._receive("hello", first=True)
@@ -118,7 +119,7 @@ class Connection:
         with suppress(Exception):
             if self.address.wire.marks_episodes and not self._fault:
                 self._send("end", {})
-            self._socket.close()
+            self._opened.close()
 
     def _send(self, kind: Kind, payload: Mapping[Any, Any]) -> int:
         self._seq += 1
@@ -133,7 +134,8 @@ class Connection:
             message = self.address.wire.read(frame, of_client=False, first=first)
             if message.kind == "error":
                 said = str(message.payload.get("error", message.payload)).strip()
-                raise BadMessage(f"it answers with an error: {said[-300:]}")
+                last = said.splitlines()[-1:]  # of a traceback, the cause
+                raise BadMessage(f"it answers with an error: {''.join(last):.300}")
             asked = self._asked.popleft() if self._asked else 0
             numbered = self.address.wire.marks_episodes
             if message.kind != kind or (numbered and message.seq != asked):
@@ -156,18 +158,21 @@ class Connection:
                 if isinstance(error, TimeoutError):
                     self._fault = f"no answer within {REPLY_S:g} s"
                 with suppress(Exception):
-                    self._socket.close()
+                    self._opened.close()
             raise BadPlan(f"served: {self.address.url}: {self._fault:.400}.") from error
 
 
-def _open(url: str) -> "ClientConnection":
-    """A socket to a server that may just be starting. Raises: BadEndpoint."""
+def _open(url: str, opened: ExitStack) -> "ClientConnection":
+    """A socket, closed with `opened`, to a server that may just be starting.
+
+    Raises: BadEndpoint.
+    """
     from websockets.exceptions import InvalidHandshake
     from websockets.sync.client import connect
 
     for wait_s in (*TRIES_S, None):
         try:
-            return connect(
+            connecting = connect(
                 url,
                 compression=None,
                 max_size=LARGEST_MESSAGE,
@@ -177,6 +182,7 @@ def _open(url: str) -> "ClientConnection":
                 ping_interval=None,  # a server may not answer one while it computes
                 proxy=None,
             )
+            return opened.enter_context(connecting)
         except (OSError, InvalidHandshake, EOFError) as error:
             if wait_s is None or isinstance(error, InvalidHandshake):
                 raise BadEndpoint(

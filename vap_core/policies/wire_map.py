@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from vap_core.base.errors import BadMessage, BadPolicy, first_line, one_of
 from vap_core.base.files import read_file
-from vap_core.base.types import Rgb
+from vap_core.base.types import Rgb, kind_of
 from vap_core.policies.protocol import Chunk, PolicyInput
 from vap_core.policies.wires import Path, at, put
 from vap_core.simulation.types import EE_ACTION
@@ -304,7 +304,7 @@ def _enter(ours: np.ndarray, name: str, numbers: np.ndarray, joints: np.ndarray)
             ours[:, -1] = level if name.startswith("opening") else 1 - level
 
 
-def _formed(rgb: Rgb, picture: Picture) -> Rgb:
+def _formed(rgb: Rgb, picture: Picture) -> np.ndarray:
     """A picture as the server wants it."""
     import cv2
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from math import prod
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgpack
 import numpy as np
@@ -33,6 +33,8 @@ ARRAY, IMAGE, SCALAR = "__ndarray__", "__image__", "__npgeneric__"
 """What marks a map that stands for an array, an encoded picture, or a NumPy number."""
 TOKEN = "VAP_TOKEN"
 """The environment variable with the token that servers here want and clients here send."""
+UPSTREAM_TOKEN = "VAP_UPSTREAM_TOKEN"
+"""That of the token for the server behind the proxy; without it the client's header goes on."""
 type Frame = bytes | str
 type Kind = Literal["hello", "start", "observation", "action", "end", "error"]
 type Path = tuple[str, ...]
@@ -53,6 +55,7 @@ class Message:
         return int(self.around.get("seq", 0))
 
 
+@runtime_checkable
 class Wire(Protocol):
     """How one kind of policy server talks. `health` is the path that says whether it is up.
 
@@ -272,7 +275,7 @@ def put(tree: Mapping[Any, Any], path: Path, part: Any) -> dict[Any, Any]:
     return {**tree, first: inner}
 
 
-def authorization(token: str | None = None) -> dict[str, str]:
-    """The header that openpi's clients send; none without a token."""
-    token = os.environ.get(TOKEN, "") if token is None else token
+def authorization(variable: str = TOKEN) -> dict[str, str]:
+    """The header that openpi's clients send, with the token of a variable; none without one."""
+    token = os.environ.get(variable, "").strip()
     return {"Authorization": f"Api-Key {token}"} if token else {}

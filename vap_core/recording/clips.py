@@ -212,8 +212,9 @@ def dataset_blueprint(
     views below."""
     rows: list[Part] = []
     votes: list[Part] = []
+    stack = rrb.Vertical if len(cameras) > 1 else rrb.Horizontal
     for camera in cameras:
-        rows.append(rrb.Vertical(policy_view(camera), mask_view(camera), vote_view(camera)))
+        rows.append(stack(policy_view(camera), mask_view(camera), vote_view(camera)))
         votes.append(vote_picture_view(camera))
     below = rrb.Horizontal(
         instruction_view(),

@@ -7,7 +7,6 @@ personal object passes untouched.
 """
 
 import asyncio
-import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +26,7 @@ from vap_core.base.types import Attended, Event, Track, Views
 from vap_core.policies.wire_map import is_picture
 from vap_core.policies.wires import (
     LARGEST_MESSAGE,
+    UPSTREAM_TOKEN,
     Frame,
     Message,
     Path,
@@ -43,16 +43,20 @@ from vap_core.serve.server import AWAY, BROKEN, WAITING, cores, fault
 
 TEXTS = ("prompt", "task", "task_description", "language_instruction", "instruction")
 """Where clients put the command; the first that is there."""
-UPSTREAM_TOKEN = "VAP_UPSTREAM_TOKEN"
-"""The environment variable with the token of the server behind; else the client's goes on."""
 TRIES_S = (0.5, 1.0, 2.0)
 """The waits between attempts to reach the server behind."""
 SMALLEST_PX = 16
 """A smaller array of three channels is no picture."""
 MOST_NUMBERS = 64
 """Longer vectors of numbers are no robot's state."""
-STRIDES = 2.0
-"""A robot that comes back in one call from more than so many of its longest moves was put back."""
+NEARER = 6.0
+"""A robot that is so many times nearer to its first state than one call before is back there."""
+JUMP = 2.0
+"""Views that change so many times as much as ever before are of another scene."""
+NO_STATE = (
+    "; there is no robot state in the messages, so that with the same command on the same "
+    "connection another episode shows only where every view jumps"
+)
 THUMBNAIL_PX = 32
 type NewEpisode = Literal["auto", "prompt", "connection", "never"]
 
@@ -136,6 +140,8 @@ class Stream:
         vector = state_vector(payload)
         read = time.perf_counter()
         why = self._starts(text, vector, views)
+        if why and not vector.size and self._new_episode == "auto":
+            why += NO_STATE
         episode = self._ongoing
         if why or episode is None:
             self._ongoing = None  # a start that fails leaves no episode behind
@@ -188,7 +194,7 @@ class Stream:
         if put_back(episode, vector):
             return "the robot is back where the episode began, in one call"
         change = _change(episode, views)
-        if episode.call > 2 and change > STRIDES * episode.largest_change:
+        if episode.call > 2 and change > JUMP * episode.largest_change:
             return f"every view changes at once ({change:.0f} levels)"
         return ""
 
@@ -294,13 +300,13 @@ def state_vector(payload: Mapping[Any, Any]) -> np.ndarray:
 
 
 def put_back(episode: Ongoing, vector: np.ndarray) -> bool:
-    """Whether the state has come back to the first one in one call, from farther than two of its
-    longest moves in at least two of its numbers, and in all that were so far."""
+    """Whether the state has come back to the first one in one call, from farther than its longest
+    move before in at least two of its numbers, and in all that were so far."""
     if episode.longest is None or not _fits(episode, vector) or episode.call < 3:
         return False
     first, last = episode.vectors[0], episode.vectors[-1]
-    far = np.abs(last - first) > STRIDES * np.maximum(episode.longest, 1e-4)
-    near = np.abs(vector - first) < np.abs(last - first) / 4
+    far = np.abs(last - first) > np.maximum(episode.longest, 1e-4)
+    near = np.abs(vector - first) < np.abs(last - first) / NEARER
     return int(far.sum()) >= 2 and bool(near[far].all())
 
 
@@ -397,8 +403,7 @@ class Proxy:
 
     async def _reach(self, client: ServerConnection) -> ClientConnection:
         """A connection to the server behind. Raises: OSError, InvalidHandshake, TimeoutError."""
-        token = os.environ.get(UPSTREAM_TOKEN, "")
-        headers = authorization(token)
+        headers = authorization(UPSTREAM_TOKEN)
         given = client.request.headers.get("Authorization") if client.request else None
         if given and not headers and not authorization():
             headers = {"Authorization": given}

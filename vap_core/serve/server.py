@@ -20,7 +20,7 @@ from websockets.asyncio.server import Request, Response, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from vap_core.base.errors import BadEndpoint, VapError, first_line
-from vap_core.policies.protocol import Policy
+from vap_core.policies.protocol import Policy, PolicyInput
 from vap_core.policies.wire_map import FORMATS, WireMap
 from vap_core.policies.wires import (
     LARGEST_MESSAGE,
@@ -68,7 +68,7 @@ async def listen(
 
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        with suppress(NotImplementedError, RuntimeError):  # not in a thread
+        with suppress(NotImplementedError, RuntimeError, ValueError):  # not in a thread
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     try:
         server = await serve(
@@ -131,9 +131,10 @@ class PolicyServer:
                             if not wire.marks_episodes:
                                 await socket.send(RESET)
                     elif message.kind == "observation":
+                        given = self.map.observation(decoded(message.payload), self.cameras)
                         state = self._start(message) if state is None else state
                         if not queue:
-                            state, chunk = await self._plan(state, message)
+                            state, chunk = await self._plan(state, given)
                             queue.extend(chunk[: self.policy.execute])
                         actions: Any = queue.popleft() if wire.by_step else np.stack(queue)
                         if not wire.by_step:
@@ -163,9 +164,7 @@ class PolicyServer:
         self._episodes += 1
         return self.policy.start(np.random.default_rng([0, number]))
 
-    async def _plan(self, state: Any, message: Message) -> tuple[Any, np.ndarray]:
-        given = self.map.observation(decoded(message.payload), self.cameras)
-
+    async def _plan(self, state: Any, given: PolicyInput) -> tuple[Any, np.ndarray]:
         def call() -> tuple[Any, np.ndarray]:
             (after,), (chunk,) = self.policy.plan([state], [given])
             return after, chunk
