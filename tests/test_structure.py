@@ -23,6 +23,7 @@ LAYERS = (
     ("perception",),
     METHOD,
     ("simulation",),
+    ("environments",),
     ("policies",),
     ("rollout",),
     ("recording",),

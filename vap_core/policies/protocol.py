@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
@@ -16,7 +17,7 @@ from jaxtyping import Float32
 from vap_core.base.errors import BadPolicy
 from vap_core.base.files import SHIPPED as SHIPPED
 from vap_core.base.types import Views, value
-from vap_core.simulation.env import Env
+from vap_core.simulation.types import Pose
 
 if TYPE_CHECKING:
     from torch import nn
@@ -30,12 +31,14 @@ Chunk = Float32[np.ndarray, "t a"]
 class PolicyInput:
     """All that a policy may read: images, text and proprioception. Never simulator state.
 
-    `state` is that of simulation.types.Observation.
+    `state` is that of simulation.types.Observation. `places` are the objects' poses by name, for a
+    policy that declares `needs_places`: a motion that is not what is tested.
     """
 
     images: Views
     text: str
     state: Float32[np.ndarray, " s"]
+    places: Mapping[str, Pose] = field(default_factory=dict)
 
 
 @runtime_checkable
@@ -78,7 +81,7 @@ class PrivilegedPolicy[S](Protocol):
         ...
 
     def plan_from_simulation(
-        self, states: Sequence[S], envs: Sequence[Env]
+        self, states: Sequence[S], envs: Sequence[Any]
     ) -> tuple[list[S], list[Chunk]]:
         """The next chunk of every episode in the batch."""
         ...

@@ -26,6 +26,7 @@ from vap_core.base.errors import (
     VapError,
 )
 from vap_core.base.types import Attended, Views
+from vap_core.environments import AnyScene, Environment, open_env
 from vap_core.policies.protocol import (
     AttentionMaps,
     Policy,
@@ -67,7 +68,6 @@ from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
 from vap_core.simulation.looks import PERFECT, Sensor
 from vap_core.simulation.occluder import Occlusion
-from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites.open_row import cameras_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Observation
@@ -93,7 +93,7 @@ class Trial:
     """
 
     method: str
-    scene: Scene
+    scene: AnyScene
     policy: Policy[Any] | PrivilegedPolicy[Any]
     prompter: Prompter[Any]
     control: Control = "ee"
@@ -167,12 +167,12 @@ def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:
     return [episode for episode in episodes if episode.outcome is None]
 
 
-def _env(trial: Trial, row: EpisodeRow) -> Env:
+def _env(trial: Trial, row: EpisodeRow) -> Environment:
     """An environment for the row's episode, in which it has not begun."""
-    return Env(
+    return open_env(
         trial.scene,
+        cameras_of(row),
         image_size=trial.image_size,
-        cameras=cameras_of(row),
         control=trial.control,
         sensor=trial.sensor,
         occlusion=trial.occlusion,
@@ -182,7 +182,8 @@ def _env(trial: Trial, row: EpisodeRow) -> Env:
 def _begin(trial: Trial, row: EpisodeRow, keeps_images: bool) -> RunningEpisode:
     env = _env(trial, row)
     env.reset(row)
-    env.pursue(row.at(0))
+    if isinstance(env, Env):
+        env.pursue(row.at(0))
     judge = Judge.start(row.at(0), trial.scene.sizes_m, env.truth())
     episode = RunningEpisode(row, env, judge, keeps_images)
     if row.subgoals:
@@ -312,6 +313,11 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
     truth = None
     if needs == "always" or (needs == "start" and not episode.prompting):
         masks = episode.env.truth(masks=True).masks
+        if not masks:
+            raise BadStudy(
+                f"{trial.method}: {episode.row.suite} has no ground truth; take a method that "
+                "reads none."
+            )
         judge = episode.judge
         truth = SceneTruth(episode.goal, masks, step=judge.steps, moved=judge.moved)
     cameras = {camera.name: camera for camera in episode.env.cameras()}
@@ -324,7 +330,8 @@ def _open_sink(
     episode.header = _header(trial, episode, attended)
     with _timed(episode.seconds, "record"):
         episode.sink = sink(episode.header) if sink is not None else None
-    if isinstance(episode.sink, WaitingSink) and not episode.row.subgoals:
+    redraws = isinstance(episode.env, Env) and not episode.row.subgoals
+    if redraws and isinstance(episode.sink, WaitingSink):
         episode.late = LateMasks(partial(_env, trial, episode.row))
         episode.sink.draw_by(episode.late.draw)
 
@@ -352,7 +359,8 @@ def _open_subgoal(episode: RunningEpisode, attended: Attended) -> None:
 def _header(trial: Trial, episode: RunningEpisode, attended: Attended) -> EpisodeHeader:
     row = episode.row
     env = episode.env
-    sizes_m = {place.model: trial.scene.sizes_m[place.model] for place in row.placements}
+    sizes_m = trial.scene.sizes_m
+    sizes_m = {each.model: sizes_m[each.model] for each in row.placements if sizes_m}
     return EpisodeHeader(
         row=row,
         method=trial.method,
@@ -408,6 +416,7 @@ def _call_policy(
         returned = policy.plan_from_simulation(states, [episode.env for episode in calling])
         return checked_plan(returned, policy.label, len(calling))
 
+    told = getattr(policy, "needs_places", False)
     raw = []
     prompted = []
     for episode in calling:
@@ -415,7 +424,8 @@ def _call_policy(
         # It cannot write: the recording shows what the prompter made.
         state = _read_only(seen.state)
         raw.append(PolicyInput(_locked(seen.images), episode.goal.instruction, state))
-        prompted.append(PolicyInput(_locked(attended.images), attended.text, state))
+        places = episode.env.truth().objects_world if told else {}
+        prompted.append(PolicyInput(_locked(attended.images), attended.text, state, places))
 
     observer: AbstractContextManager[AttentionMaps] = nullcontext({})
     if trial.attention:
@@ -457,11 +467,12 @@ def _act(
     prompts = trial.prompter.highlights and bool(attended.tracks)
     needs_masks = bool(observation.images) and (episode.sink is not None or prompts)
     if needs_masks and episode.late is not None and not prompts and not keep_images:
+        assert isinstance(episode.env, Env)
         episode.late.keep(episode.judge.steps, episode.env.snapshot())
         needs_masks = False
     truth = episode.env.truth(masks=needs_masks)
     coverage: tuple[MaskCoverage, ...] = ()
-    if prompts:
+    if prompts and truth.masks:
         opening = episode.judge.steps == episode.judge.first
         coverage = mask_coverage(attended, truth, episode.goal.target, opening=opening)
     # The method counts its own calls, from the beginning of a sub-goal.

@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from vap_core.base.types import Event
+from vap_core.environments.protocol import Environment
 from vap_core.policies.protocol import AttentionMap, Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert, ExpertState
 from vap_core.rollout.types import ConsumedInput, EpisodeHeader, Frame, SubGoalSpan
@@ -25,7 +26,7 @@ from vap_core.simulation.types import Action, EpisodeRow, Outcome, of_subgoals
 class LateMasks:
     """The states of one episode's steps; `make_env` makes an environment to draw them in."""
 
-    def __init__(self, make_env: Callable[[], Env]) -> None:
+    def __init__(self, make_env: Callable[[], Environment]) -> None:
         self._make_env = make_env
         self._env: Env | None = None
         self._snapshots: dict[int, Snapshot] = {}
@@ -40,7 +41,9 @@ class LateMasks:
         if snapshot is None:
             return frame
         if self._env is None:
-            self._env = self._make_env()
+            env = self._make_env()
+            assert isinstance(env, Env)
+            self._env = env
         self._env.restore(snapshot)
         drawn = self._env.truth(masks=True)
         return replace(frame, truth=replace(frame.truth, masks=drawn.masks, hand=drawn.hand))
@@ -80,7 +83,7 @@ class RunningEpisode:
     """
 
     row: EpisodeRow
-    env: Env
+    env: Environment
     judge: Judge
     keeps_images: bool
     stage: int = 0
@@ -143,23 +146,29 @@ def next_subgoal(episode: RunningEpisode, policy: AnyPolicy) -> None:
         step = episode.judge.steps
         text = f"sub-goal {episode.stage + 1} of {episode.row.stages} ends: {ended.status}"
         episode.notes.append(Event(step, "INFO" if ended.success else "WARN", text))
-        episode.homing = homing.begin(episode.env)
+        episode.homing = homing.begin(_own(episode))
         episode.prompting = False
     else:
-        episode.homing = homing.advance(episode.homing, episode.env)
+        episode.homing = homing.advance(episode.homing, _own(episode))
     episode.queue.clear()
     if episode.homing.part != "there":
-        episode.queue.append(homing.action(episode.homing, episode.env))
+        episode.queue.append(homing.action(episode.homing, _own(episode)))
         return
     episode.homing = None
     episode.stage += 1
     row = episode.row.at(episode.stage)
-    episode.env.pursue(row)
+    _own(episode).pursue(row)
     first = episode.judge.steps
     episode.judge = Judge.start(row, episode.judge.sizes_m, episode.env.truth(), first)
     episode.notes.append(begins(episode))
     rng = np.random.default_rng([row.seed, row.episode, episode.stage])
     episode.policy_state = policy.start(rng)
+
+
+def _own(episode: RunningEpisode) -> Env:
+    """Only our own suites have sub-goals."""
+    assert isinstance(episode.env, Env)
+    return episode.env
 
 
 def begins(episode: RunningEpisode) -> Event:

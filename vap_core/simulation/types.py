@@ -45,7 +45,8 @@ class Observation:
 class Truth:
     """Simulator ground truth after one control step.
 
-    For metrics, recordings and tests, never for an evaluated policy.
+    For metrics, recordings and tests, never for an evaluated policy. All but `succeeded` is empty
+    where an environment of another library knows no more.
     """
 
     objects_world: Mapping[str, Pose]
@@ -60,6 +61,8 @@ class Truth:
     """`masks[camera][object]`: visible pixels; empty when masks were not asked for."""
     hand: Mapping[str, Mask] = field(default_factory=dict)
     """Visible pixels of the gripper by camera; empty when masks were not asked for."""
+    succeeded: bool = False
+    """What an environment with a rule of its own says (the rule "official")."""
 
     @property
     def held(self) -> frozenset[str]:
@@ -105,7 +108,7 @@ AS_LISTED = Start()
 """Nothing changed."""
 
 
-SuccessRule = Literal["picked", "near", "put", "selected"]
+SuccessRule = Literal["picked", "near", "put", "selected", "official"]
 """When an episode has succeeded (SPEC section 6); see simulation.suites.rules."""
 
 
@@ -210,7 +213,8 @@ class Outcome:
     """How an episode ended (P 5.1).
 
     `success` at the end, `success_once` at any step, `held_steps` the longest run of steps in which
-    the rule held. `cmr` is None where the paper defines none (selection).
+    the rule held. `cmr` is None where the paper defines none (selection); all about objects is None
+    where the environment has no ground truth.
     """
 
     status: Literal["success", "failure", "error"]
@@ -218,11 +222,11 @@ class Outcome:
     success_once: bool
     held_steps: int
     cmr: bool | None
-    wrong_object: bool
-    first_object_correct: bool
+    wrong_object: bool | None
+    first_object_correct: bool | None
     steps: int
     detail: str = ""
-    touched: bool = False
+    touched: bool | None = False
     """Whether the robot touched or moved any object but the goal."""
     subgoals: tuple["Outcome", ...] = ()
     """How each sub-goal ended, in order, where there were several; steps are its own."""

@@ -13,6 +13,7 @@ from vap_core.attend import Attender, Prompting
 from vap_core.base.errors import BadStudy
 from vap_core.base.files import source_digest
 from vap_core.base.types import Colour
+from vap_core.environments import AnyScene
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
 from vap_core.policies.mini_pi0.learned_token import WORD
@@ -34,7 +35,6 @@ from vap_core.rollout.prompters import (
 )
 from vap_core.simulation import robots
 from vap_core.simulation.assets.objects import get_object
-from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import suite
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study.forms import (
@@ -383,7 +383,7 @@ def needs_stack(method: str) -> bool:
 
 
 def make_prompter(
-    method: str, row: EpisodeRow, bank: Path, scene: Scene, stack: Stack | None
+    method: str, row: EpisodeRow, bank: Path, scene: AnyScene, stack: Stack | None
 ) -> Prompter:
     """The prompter of a method for the row's target; `stack` is there where `needs_stack`.
 
@@ -416,7 +416,7 @@ def make_prompter(
             )
 
 
-def _alike(scene: Scene, row: EpisodeRow) -> frozenset[str]:
+def _alike(scene: AnyScene, row: EpisodeRow) -> frozenset[str]:
     """The scene's objects of the target's category, or of every sub-goal's."""
     categories = _categories(row)
     return frozenset(name for name in scene.objects if get_object(name).category in categories)

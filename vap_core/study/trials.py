@@ -1,6 +1,7 @@
 """A study of episodes, and what its batches need: memory, a scene, models and a policy."""
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from vap_core import __version__
+from vap_core import __version__, environments
 from vap_core.base.errors import BadStudy, command, one_of, require
 from vap_core.base.types import Rgb, value
+from vap_core.environments import AnyScene, open_env
 from vap_core.memory import load_bank, register, save
 from vap_core.perception.describe import AttributeCaptioner, with_description
 from vap_core.perception.protocols import Detector, Stack
@@ -32,13 +34,12 @@ from vap_core.policies.names import (
 )
 from vap_core.policies.protocol import Policy, PrivilegedPolicy
 from vap_core.policies.scripted.expert import Expert
-from vap_core.policies.scripted.scripted import Random, Scripted
+from vap_core.policies.scripted.scripted import PlacedScripted, Random, Scripted, ScriptedExpert
 from vap_core.rollout.calls import check_policy
 from vap_core.rollout.loop import Follow, Trial, rollout
 from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import ObjectModel, get_object
-from vap_core.simulation.env import Env
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Meshes, Scene
 from vap_core.simulation.studio import reference_views
@@ -66,12 +67,14 @@ from vap_core.study.methods import (
 )
 
 
-def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
+def scripted(detector: Detector, scene: AnyScene, suite: Suite) -> Scripted:
     """The scripted policy, calibrated to the suite's first camera.
 
     Raises: UnknownName for a camera that the scene lacks, or a robot without a scripted motion.
     """
-    (camera,) = Env(scene, cameras=suite.cameras[:1]).cameras()
+    (camera,) = open_env(scene, suite.cameras[:1]).cameras()
+    if not isinstance(scene, Scene):
+        return PlacedScripted(scene.robot, suite.hz, camera, scene.sizes_m, detector)
     return Scripted(
         detector=detector,
         camera=camera,
@@ -82,7 +85,7 @@ def scripted(detector: Detector, scene: Scene, suite: Suite) -> Scripted:
 
 
 def make_policy(
-    name: str, scene: Scene, suite: Suite, stack: Stack | None
+    name: str, scene: AnyScene, suite: Suite, stack: Stack | None
 ) -> Policy[Any] | PrivilegedPolicy[Any]:
     """One of `POLICIES`; only the scripted one needs a stack. Raises: UnknownName."""
     match name:
@@ -90,7 +93,10 @@ def make_policy(
             assert stack is not None, "the scripted policy needs a detector"
             return scripted(stack.category_detector, scene, suite)
         case "expert":
-            return Expert()
+            if isinstance(scene, Scene):
+                return Expert()
+            (camera,) = open_env(scene, suite.cameras[:1]).cameras()
+            return ScriptedExpert(scene.robot, suite.hz, camera, scene.sizes_m)
         case "random":
             return Random()
     raise one_of("make_policy: policy", name, POLICIES)
@@ -335,8 +341,8 @@ DEMO = Study(
 HIDDEN_FROM = 2
 """The call of the policy, counted from 0, from which an arm of `ablate` hides the target."""
 _stack = cache(load_stack)
-_last_scene: dict[tuple[str, tuple[str, ...], str, Meshes], Scene] = {}
-"""The scene that was built last, by suite, objects, variant and meshes."""
+_last_scene: dict[tuple[str, tuple[str, ...], str, Meshes, str], AnyScene] = {}
+"""The scene that was built last, by suite, objects, variant, meshes and another library's task."""
 
 
 def register_personal(study: Study, bank: Path) -> None:
@@ -437,7 +443,12 @@ def _occlusion(method: str, execute: int) -> Occlusion | None:
 
 
 def _policy(
-    study: Study, method: str, row: EpisodeRow, bank: Path, scene: Scene, stack: Stack | None
+    study: Study,
+    method: str,
+    row: EpisodeRow,
+    bank: Path,
+    scene: AnyScene,
+    stack: Stack | None,
 ) -> Policy[Any] | PrivilegedPolicy[Any]:
     """The frozen policy of the study; for the soft prompt with the learned token's embedding."""
     suite = suites.suite(row.suite)
@@ -480,7 +491,7 @@ def _token_embedding(
     return token.embedding
 
 
-def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
+def _scene(study: Study, rows: Sequence[EpisodeRow]) -> AnyScene:
     """The scene of what some rows of one task and variant place; the last one is kept.
 
     Objects are in the order of the variant's whole list, so that the physics of an episode does not
@@ -491,12 +502,13 @@ def _scene(study: Study, rows: Sequence[EpisodeRow]) -> Scene:
     listed = [row for row in study.rows(first.suite, first.task) if row.variant == first.variant]
     placed = models_of(rows)
     names = [name for name in models_of([*listed, *rows]) if name in placed]
-    key = (first.suite, tuple(names), first.variant, study.robots)
+    elsewhere = first.task if suites.suite(first.suite).environment else ""
+    key = (first.suite, tuple(names), first.variant, study.robots, elsewhere)
     if key not in _last_scene:
         for scene in _last_scene.values():
             scene.close()
         _last_scene.clear()
-        _last_scene[key] = build_scene(*key)
+        _last_scene[key] = environments.open_world(rows) if elsewhere else build_scene(*key[:-1])
     return _last_scene[key]
 
 
@@ -531,11 +543,16 @@ def feasible(rows: Sequence[EpisodeRow]) -> tuple[bool, ...]:
 def _try_rows(rows: Sequence[EpisodeRow]) -> list[bool]:
     """`feasible` for rows of one suite and variant."""
     suite = suites.suite(rows[0].suite)
-    with build_scene(suite.name, models_of(rows), rows[0].variant) as scene:
+    scene: AnyScene
+    if suite.environment:
+        scene = environments.open_world(rows)
+    else:
+        scene = build_scene(suite.name, models_of(rows), rows[0].variant)
+    with closing(scene):
         trial = Trial(
             method="generic",
             scene=scene,
-            policy=Expert(),
+            policy=make_policy("expert", scene, suite, None),
             prompter=generic(),
             control=suite.control,
             sensor=suite.sensor,

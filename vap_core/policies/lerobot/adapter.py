@@ -22,6 +22,7 @@ from jaxtyping import Float32
 
 from vap_core.base.errors import BadPolicy
 from vap_core.base.types import value
+from vap_core.environments import AnyScene, open_env
 from vap_core.policies.lerobot.checkpoints import PIPELINES, locate, stamp
 from vap_core.policies.lerobot.hooks import (
     can_watch,
@@ -43,8 +44,6 @@ from vap_core.policies.protocol import (
     report_input,
     state_sha256,
 )
-from vap_core.simulation.env import Env
-from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites import Suite
 
 if TYPE_CHECKING:
@@ -330,7 +329,7 @@ _loaded: dict[tuple[str, float | None], tuple[object, LeRobot]] = {}
 
 
 def load_for_suite(
-    checkpoint: str, scene: Scene, suite: Suite, temperature: float | None = None
+    checkpoint: str, scene: AnyScene, suite: Suite, temperature: float | None = None
 ) -> LeRobot:
     """The checkpoint, loaded once in this process, for the inputs and actions of a suite.
 
@@ -346,8 +345,8 @@ def load_for_suite(
     if key not in _loaded:
         _loaded[key] = (now, load_policy(checkpoint, temperature=temperature))
     policy = _loaded[key][1]
-    env = Env(scene, control=suite.control)
-    policy.check(suite.cameras, len(env.state()), env.action_size)
+    env = open_env(scene, suite.cameras, control=suite.control)
+    policy.check(suite.cameras, len(env.state()), len(env.action_names))
     return policy
 
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -16,6 +16,8 @@ from vap_core.instruction import leading_category
 from vap_core.perception.protocols import Detector
 from vap_core.policies.protocol import TEXT, Chunk, PolicyInput, report_input
 from vap_core.prompt import PALETTE, has_colour
+from vap_core.simulation import cameras as optics
+from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.control import LEAD_JOINT_RAD, arm
 from vap_core.simulation.env import Env
 from vap_core.simulation.robots import Robot
@@ -74,7 +76,7 @@ SPAN = re.compile(rf"\b(?:the\s+(?P<colour>{COLOUR_NAMES})|{OWNER}|the|a|an)\s+"
 """The words before a category: an article, a possessive, or "the" with a colour."""
 PLACE = re.compile(
     r"\b(?P<how>near|next to|beside|on|onto|in|into|inside)\s+"
-    rf"(?:(?:the\s+(?P<colour>{COLOUR_NAMES})|{OWNER}|the|a|an)\s+)?",
+    rf"(?:(?:the\s+(?P<colour>{COLOUR_NAMES})|{OWNER}|the|a|an)\s+)?(?:(?P<side>left|right)\s+)?",
     re.IGNORECASE,
 )
 NEAR = ("near", "next to", "beside")
@@ -86,6 +88,8 @@ CONFIDENT = 0.2
 instances better, which must not decide."""
 STAYED_M = 0.05
 """An object that is farther away than this from where the chosen one was is another object."""
+RIMMED = frozenset({"mug", "bowl"})
+"""Categories wider than the hand."""
 WIDEST_M = 0.15
 """Radius of the widest thing that something is put on, metres."""
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -100,7 +104,8 @@ Place = Float64[np.ndarray, "4"]
 class Command:
     """What an instruction asks for: a verb, the target's colour and category, and a goal.
 
-    `verb` is pick, put, near or touch; a colour None and `goal` "" where the text names none.
+    `verb` is pick, put, near or touch; a colour None, `goal` and `goal_side` (left, right: of
+    several in the picture) "" where the text names none.
     """
 
     verb: str
@@ -108,6 +113,7 @@ class Command:
     category: str
     goal: str = ""
     goal_colour: Colour | None = None
+    goal_side: str = ""
 
 
 def read(text: str) -> Command:
@@ -122,7 +128,8 @@ def read(text: str) -> Command:
         goal, _ = leading_category(text[place.end() :])
         if goal and goal != "table":
             verb = "near" if place["how"].lower() in NEAR else "put"
-            return Command(verb, colour, category, goal, _colour_named(place["colour"]))
+            of_goal = _colour_named(place["colour"]), (place["side"] or "").lower()
+            return Command(verb, colour, category, goal, *of_goal)
     verb = "touch" if TOUCH.search(text) else "pick"
     return Command(verb, colour, category)
 
@@ -154,7 +161,7 @@ class MonocularLocalizer:
         boxes = self.detector([rgb], command.category)[0]
         if not len(boxes):
             return None
-        best = self._of_colour(rgb, boxes, command.colour)
+        best = box_of_colour(rgb, boxes, command.colour)
         if best is not None:
             return self.place(boxes.xyxy[best], self.thick_m)
         if before is None:
@@ -165,20 +172,22 @@ class MonocularLocalizer:
         nearest = int(np.argmin(distances))
         return places[nearest] if distances[nearest] < STAYED_M else None
 
-    def find(self, rgb: Rgb, category: str, colour: Colour | None = None) -> Place | None:
+    def find(
+        self, rgb: Rgb, category: str, colour: Colour | None = None, side: str = ""
+    ) -> Place | None:
         """Where the most confident box of a category stands; None when there is none.
 
-        A colour that is named and seen decides.
+        A side, or a colour that is named and seen, decides.
         """
         boxes = self.detector([rgb], category)[0]
         if not len(boxes):
             return None
-        return self.place(boxes.xyxy[self._of_colour(rgb, boxes, colour) or 0], WIDEST_M)
-
-    def _of_colour(self, rgb: Rgb, boxes: Boxes, colour: Colour | None) -> int | None:
-        """The box that has most of a colour; None where none has enough of it."""
-        shares = coloured(rgb, boxes, colour) if colour is not None else np.zeros(1)
-        return int(shares.argmax()) if shares.max() >= COLOURED else None
+        if side:
+            confident = boxes.xyxy[boxes.score >= CONFIDENT * boxes.score[0]]
+            middle = confident[:, [0, 2]].mean(axis=1)
+            at = int(middle.argmin() if side == "left" else middle.argmax())
+            return self.place(confident[at], WIDEST_M)
+        return self.place(boxes.xyxy[box_of_colour(rgb, boxes, colour) or 0], WIDEST_M)
 
     def place(self, box: Float32[np.ndarray, "4"], thick_m: float) -> Place:
         """The place of an upright object by its box: that of the cylinder whose outline fills it.
@@ -222,6 +231,70 @@ class MonocularLocalizer:
         return pose[:3, :3], pose[:3, 3]
 
 
+@dataclass(frozen=True)
+class TruePlaces:
+    """Where things stand, by the simulator. Which of them is meant, the picture says, or `target`.
+
+    `places` are the objects' poses, `sizes_m` their full extents.
+    """
+
+    places: Mapping[str, Pose]
+    sizes_m: Mapping[str, tuple[float, float, float]]
+    camera: Camera
+    detector: Detector | None = None
+    target: str = ""
+    table_z = 0.0
+
+    def choose(self, rgb: Rgb, command: Command, draw: float, before: Place | None) -> Place | None:
+        """As MonocularLocalizer.choose."""
+        if self.target:
+            return self.place(self.target)
+        assert self.detector is not None
+        boxes = self.detector([rgb], command.category)[0]
+        alike = self._of_kind(command.category)
+        if not len(boxes) or not alike:
+            return None
+        best = box_of_colour(rgb, boxes, command.colour)
+        if best is None and before is not None:
+            return self.place(self.nearest(command.category, before[:2]))
+        if best is None:
+            best = int(draw * len(boxes.xyxy[boxes.score >= CONFIDENT * boxes.score[0]]))
+        middles = np.array([self.places[name][:3] for name in alike])
+        middles[:, 2] += [self.sizes_m[name][2] / 2 for name in alike]
+        box = boxes.xyxy[best].reshape(2, 2).mean(axis=0)
+        gaps = np.linalg.norm(optics.project(self.camera, middles) - box, axis=1)
+        return self.place(alike[int(gaps.argmin())])
+
+    def find(
+        self, rgb: Rgb | None, category: str, colour: Colour | None = None, side: str = ""
+    ) -> Place | None:
+        """The place of the only thing of a category, or of the one on that side of the picture."""
+        alike = self._of_kind(category)
+        if not alike:
+            return None
+        points = np.array([self.places[name][:3] for name in alike])
+        at = optics.project(self.camera, points)[:, 0]
+        return self.place(alike[int(at.argmax() if side == "right" else at.argmin())])
+
+    def nearest(self, category: str, xy: Float64[np.ndarray, "2"]) -> str:
+        gaps = {name: np.hypot(*(self.places[name][:2] - xy)) for name in self._of_kind(category)}
+        return min(gaps, key=lambda name: gaps[name])
+
+    def place(self, name: str) -> Place:
+        x, y = self.places[name][:2]
+        width, depth, height = self.sizes_m[name]
+        return np.array([x, y, min(width, depth) / 2, height])
+
+    def _of_kind(self, category: str) -> list[str]:
+        return [name for name in self.places if get_object(name).category == category]
+
+
+def box_of_colour(rgb: Rgb, boxes: Boxes, colour: Colour | None) -> int | None:
+    """The box that has most of a colour; None where none has enough of it."""
+    shares = coloured(rgb, boxes, colour) if colour is not None else np.zeros(1)
+    return int(shares.argmax()) if shares.max() >= COLOURED else None
+
+
 def coloured(rgb: Rgb, boxes: Boxes, colour: Colour) -> Float64[np.ndarray, " n"]:
     """The share of each box's pixels that have `colour`."""
     shares = np.zeros(len(boxes))
@@ -250,6 +323,8 @@ SPEED_M_S = 0.20
 GAIN = 0.7
 """Share of the remaining way that one action asks for; below 1 so that a lagging arm does not
 overshoot."""
+MOST_RAD = 0.3
+"""The most that one action asks the hand to turn."""
 REPLAN_S = 0.4
 """Between two calls; what is planned in between is carried out."""
 Phase = Literal["seek", "above", "descend", "close", "lift", "carry", "lower", "open", "leave"]
@@ -280,6 +355,12 @@ class Motion:
     desk nearer than anything else."""
     empty: float = 0.08
     """A closed gripper that reads less than this holds nothing: try again."""
+    rim_m: float = 0.0
+    """How far from its axis a RIMMED thing is grasped, on the far side, with the hand turned by a
+    quarter; 0 where it fits between the fingers."""
+    speed_m_s: float = SPEED_M_S
+    follow: float = 1.0
+    """The share of what one action asks for that the arm does within it."""
 
 
 MOTIONS = {
@@ -287,6 +368,9 @@ MOTIONS = {
     "panda": Motion(),
     "google": Motion(thick_m=0.035, hover_m=0.20, close_s=1.4, arrived_m=0.02),
     "so101": Motion(thick_m=0.028, hover_m=0.13, lift_m=0.09, close_s=0.6, beside_m=0.04),
+    "libero": Motion(
+        thick_m=0.05, hover_m=0.24, lift_m=0.16, empty=0.02, rim_m=0.042, speed_m_s=1.0, follow=0.22
+    ),
 }
 SHIPPED_MOTIONS: Mapping[str, Motion] = MappingProxyType(dict(MOTIONS))
 """The motions of the robots that ship, whatever the file of an own suite enters in MOTIONS."""
@@ -329,7 +413,7 @@ class Scripted:
             raise one_of("scripted: motion of robot", robot.name, MOTIONS)
         self.robot = robot
         self.motion = MOTIONS[robot.name]
-        self.localizer = MonocularLocalizer(
+        self.localizer: MonocularLocalizer | TruePlaces = MonocularLocalizer(
             detector=detector,
             camera=camera,
             base_world=robot.base_world,
@@ -365,7 +449,8 @@ class Scripted:
                 state = replace(state, goal=found)
         if command.goal and state.goal is not None and state.spot is None:
             target = state.goal
-            place = self.localizer.find(rgb, command.goal, command.goal_colour)
+            wanted = command.goal, command.goal_colour, command.goal_side
+            place = self.localizer.find(rgb, *wanted)
             if place is not None and command.verb == "put":
                 state = replace(state, spot=np.array([*place[:2], 0.015]))
             elif place is not None:  # near it, on the side of the target
@@ -382,10 +467,10 @@ class Scripted:
             state = replace(state, phase=phase, waited_s=waited_s)
         if state.joints is None or np.abs(state.joints - joints).max() > LEAD_JOINT_RAD:
             state = replace(state, joints=joints)
-        return self._act(state, command, hand)
+        return self._act(state, command, hand, float(policy_input.state[5]))
 
     def _act(
-        self, state: ScriptedState, command: Command, hand: Point
+        self, state: ScriptedState, command: Command, hand: Point, yaw: float
     ) -> tuple[ScriptedState, Chunk]:
         """A chunk towards the aim: deltas of the hand, or of the joints that carry it there."""
         aim = hand
@@ -394,14 +479,18 @@ class Scripted:
             aim, opening = self._aim(state, command)
         joints = state.joints
         assert joints is not None
-        longest = SPEED_M_S / self.hz
+        longest = self.motion.speed_m_s / self.hz
         rows: list[list[float]] = []
         for _ in range(self.execute):
             delta = GAIN * (aim - hand)
             delta *= min(1.0, longest / max(float(np.linalg.norm(delta)), 1e-9))
-            hand = hand + delta
+            hand = hand + self.motion.follow * delta
+            turn = 0.0
+            if self._rim_m(command):
+                turn = float(np.clip(GAIN * (np.pi / 2 - yaw), -MOST_RAD, MOST_RAD))
+                yaw += self.motion.follow * turn
             if self.control == "ee":
-                rows.append([*delta, 0.0, 0.0, 0.0, opening])
+                rows.append([*delta, 0.0, 0.0, turn, opening])
             elif state.goal is None:
                 rows.append([*np.zeros(len(joints)), opening])
             else:
@@ -463,4 +552,63 @@ class Scripted:
                 heights = {"descend": grasp, "close": grasp, "lift": grasp + self.motion.lift_m}
                 z = heights.get(state.phase, hover)
                 opening = float(state.phase not in ("close", "lift"))
-        return np.array([x, y, self.localizer.table_z + z]), opening
+        return np.array([x + self._rim_m(command), y, self.localizer.table_z + z]), opening
+
+    def _rim_m(self, command: Command) -> float:
+        return self.motion.rim_m if command.category in RIMMED else 0.0
+
+
+class PlacedScripted(Scripted):
+    """The scripted policy in other libraries' environments: it is told where things stand, and the
+    picture says only which one is meant."""
+
+    needs_places = True
+    replan_s = 0.2
+
+    def __init__(
+        self,
+        robot: Robot,
+        hz: float,
+        camera: Camera,
+        sizes_m: Mapping[str, tuple[float, float, float]],
+        detector: Detector | None = None,
+    ) -> None:
+        self.robot, self.motion, self.hz = robot, MOTIONS[robot.name], hz
+        self.control = "ee"
+        self.execute = max(1, round(self.replan_s * hz))
+        self.localizer = TruePlaces({}, sizes_m, camera, detector)
+
+    def _plan_episode(
+        self, state: ScriptedState, policy_input: PolicyInput
+    ) -> tuple[ScriptedState, Chunk]:
+        assert isinstance(self.localizer, TruePlaces)
+        self.localizer = replace(self.localizer, places=policy_input.places)
+        command = read(policy_input.text)
+        goal = self.localizer.find(None, command.goal, None, command.goal_side)
+        if state.phase in ("carry", "lower") and goal is not None:
+            # What is held hangs askew: its own middle is brought over the goal's.
+            rim = np.array([self._rim_m(command), 0.0])
+            hand = policy_input.state[:2] - rim
+            held = self.localizer.place(self.localizer.nearest(command.category, hand))
+            state = replace(state, spot=np.array([*(goal[:2] + hand - held[:2]), 0.015]))
+        return super()._plan_episode(state, policy_input)
+
+
+class ScriptedExpert(PlacedScripted):
+    """The same motion, to the target of the episode."""
+
+    label = "expert"
+    replan_s = 0.0
+
+    def plan_from_simulation(
+        self, states: Sequence[ScriptedState], envs: Sequence[Any]
+    ) -> tuple[list[ScriptedState], list[Chunk]]:
+        assert isinstance(self.localizer, TruePlaces)
+        planned = []
+        for state, env in zip(states, envs, strict=True):
+            self.localizer = replace(self.localizer, target=env.row.target)
+            images = {self.localizer.camera.name: np.zeros((1, 1, 3), np.uint8)}
+            places = env.truth().objects_world
+            seen = PolicyInput(images, env.row.instruction, env.state(), places)
+            planned.append(self._plan_episode(state, seen))
+        return [state for state, _ in planned], [chunk for _, chunk in planned]

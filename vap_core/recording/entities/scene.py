@@ -26,10 +26,13 @@ TEXTURE_PX = 96
 
 @lru_cache(maxsize=256)
 def object_mesh(name: str) -> rr.Mesh3D | None:
-    """An object's shape and decoration; None for one that the registry does not hold."""
+    """An object's shape and decoration; None for one that the registry does not hold, or that is
+    another library's."""
     try:
         model = get_object(name)
     except UnknownName:
+        return None
+    if model.split == "foreign":
         return None
     mesh = mesh_of(model)
     picture = texture_image(model)

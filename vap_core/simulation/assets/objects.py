@@ -50,12 +50,12 @@ class ObjectModel:
     """One object: its category, the split that may use it, its shape, its texture and its mass.
 
     `shape` and `texture` are the parameters that a drawn object has. A scan is its own shape, and
-    its texture is the picture.
+    its texture is the picture. A "foreign" one is another library's; no recording holds its mesh.
     """
 
     name: str
     category: str
-    split: Literal["generic", "personal", "lookalike", "prop"]
+    split: Literal["generic", "personal", "lookalike", "prop", "foreign"]
     shape: dict[str, Any] | Scan
     texture: Texture | Rgb
     mass_kg: float

@@ -35,6 +35,8 @@ WARM_UPS: dict[str, Suite] = {"widowx-pick": layout.WIDOWX, "franka-pick": layou
 SHARED: dict[str, Suite] = shared.SUITES
 """Scenes that two people share: two objects in turn, or two at once."""
 SUITES: dict[str, Suite] = {**BENCHMARKS, **SHARED, **WARM_UPS}
+ELSEWHERE: dict[str, Suite] = {}
+"""Suites of other libraries' environments; `vap_core.environments` enters them."""
 DEVELOPMENT = "-dev"
 """Ends the name of a suite to tune on, beside each benchmark."""
 ABSENT = "-absent"
@@ -47,8 +49,9 @@ ENDINGS = (ABSENT, RED, DEVELOPMENT)
 
 def suite(name: str) -> Suite:
     """The suite called `name`. Raises: UnknownName."""
-    if name in SUITES:
-        return SUITES[name]
+    for known in (SUITES, ELSEWHERE):
+        if name in known:
+            return known[name]
     own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.suite
@@ -57,7 +60,7 @@ def suite(name: str) -> Suite:
             "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own "
             f"by its file or {own.VARIABLE})",
             name,
-            SUITES,
+            [*SUITES, *ELSEWHERE],
         )
     return replace(BENCHMARKS[benchmark_name(name)], name=name)
 
@@ -80,7 +83,7 @@ def is_listed(name: str) -> bool:
 
     A shared scene has one, too.
     """
-    return name in SHARED or benchmark_name(name) in BENCHMARKS
+    return name in (*SHARED, *ELSEWHERE) or benchmark_name(name) in BENCHMARKS
 
 
 def open_file(path: Path) -> Suite:
@@ -194,6 +197,8 @@ def _seeded(suite_name: str, task_name: str, seed: int) -> tuple[EpisodeRow, ...
     """The list of a task under a seed."""
     joints = len(robots.get(suite(suite_name).robot).joints)
     of_task = (row for row in benchmark(suite_name) if row.task == task_name)
+    if suite(suite_name).environment:  # an official start stays as it is
+        return tuple(replace(row, seed=seed) for row in of_task)
     return tuple(starts.seeded(row, seed, joints) for row in of_task)
 
 

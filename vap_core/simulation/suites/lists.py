@@ -233,7 +233,8 @@ def _faults(row: EpisodeRow) -> Iterator[tuple[str, str]]:
                 f"{other.model!r} and {one.model!r} stand in the same place; objects keep at least "
                 f"{CLOSE_M} m apart",
             )
-    if bool(row.goal) != (row.rule in ("near", "put")) or row.goal not in ("", *names[1:]):
+    needs_goal = bool(row.goal) if row.rule == "official" else row.rule in ("near", "put")
+    if bool(row.goal) != needs_goal or row.goal not in ("", *names[1:]):
         yield (
             "goal",
             f"{row.goal!r} for rule {row.rule!r}; near and put name a placed object other than the "

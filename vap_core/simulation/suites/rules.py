@@ -13,6 +13,7 @@ touching the receptacle and besides it at most the robot, and what an earlier su
 *Selected*: pressed by the gripper for more than 10 ms, no other object touched by the robot before.
 The goal of a task is no object to be confused with: touching or moving it is neither right nor
 wrong, and what an earlier sub-goal put into it moves when it moves within it.
+*Official*: what the environment of another library says.
 *CMR* (P 5.1): the target moved more than 3 cm from where it settled, at least once, whatever the
 outcome; undefined for selection.
 """
@@ -38,7 +39,9 @@ STILL_STEPS = 5
 """Released at the goal for STILL_STEPS, and moved less than STILL_M in the last: it may end."""
 LIFTED_M = 0.05
 """A held target this high is clear of the table: the lift is done and the episode may end."""
-HELD_STEPS: Mapping[SuccessRule, int] = {"picked": 5, "near": 1, "put": 1, "selected": 1}
+HELD_STEPS: Mapping[SuccessRule, int] = {
+    **{"picked": 5, "near": 1, "put": 1, "selected": 1, "official": 1}
+}
 """Steps in a row for which a rule's condition must hold."""
 Size = tuple[float, float, float]
 """Full extents of an object, metres."""
@@ -79,7 +82,7 @@ class Judge:
     def start(row: EpisodeRow, sizes_m: Sizes, truth: Truth, first: int = 0) -> "Judge":
         """Before the first action, with everything settled, `first` steps after the episode's."""
         start_world = {}
-        for place in row.placements:
+        for place in row.placements if truth.objects_world else ():
             start_world[place.model] = truth.objects_world[place.model].copy()
         return Judge(
             row=row, sizes_m=sizes_m, start_world=start_world, now=truth, steps=first, first=first
@@ -101,7 +104,9 @@ class Judge:
             self,
             now=truth,
             steps=self.steps + 1,
-            step_m=math.dist(_middle_of(self, truth, target), _middle_of(self, self.now, target)),
+            step_m=math.dist(_middle_of(self, truth, target), _middle_of(self, self.now, target))
+            if self.start_world
+            else 0.0,
             run=run,
             held_steps=max(self.held_steps, run),
             success_once=self.success_once or run >= HELD_STEPS[self.row.rule],
@@ -150,7 +155,7 @@ class Judge:
         """Nothing is left to do: lifted clear of the table, released at the goal, or selected."""
         if self.row.rule == "picked":
             return self.success and _lift_m(self, self.now) > LIFTED_M
-        if self.row.rule == "selected":
+        if self.row.rule in ("selected", "official"):
             return self.success
         free = ROBOT not in self.now.contacts.get(self.row.target, ())
         return self.success and free and self.step_m < STILL_M and self.run >= STILL_STEPS
@@ -163,6 +168,7 @@ class Judge:
             status = "success" if self.success else "failure"
         target = self.row.target
         selecting = self.row.rule == "selected"
+        known = bool(self.start_world)
         others = set(self.start_world) - {target, self.row.goal}
         handled = set(self.moved)
         if selecting:
@@ -172,12 +178,12 @@ class Judge:
             success=status == "success",
             success_once=self.success_once,
             held_steps=self.held_steps,
-            cmr=None if selecting else target in self.moved,
-            wrong_object=bool(others & handled),
-            first_object_correct=self.order[:1] == (target,),
+            cmr=None if selecting or not known else target in self.moved,
+            wrong_object=bool(others & handled) if known else None,
+            first_object_correct=self.order[:1] == (target,) if known else None,
             steps=self.steps - self.first,
             detail=detail,
-            touched=bool(self.order),
+            touched=bool(self.order) if known else None,
         )
 
 
@@ -244,6 +250,7 @@ CONDITIONS: Mapping[SuccessRule, Callable[[Judge, Truth, Names], bool]] = {
     "near": _near,
     "put": _put,
     "selected": _selected,
+    "official": lambda judge, truth, order: truth.succeeded,
 }
 """Whether a rule's condition holds: of the judge before a step, the truth after it, and `order`."""
 

@@ -41,7 +41,8 @@ class Task:
 class Suite:
     """A set of tasks on one robot.
 
-    `control` says what an action is (types.Action), `sensor` how the cameras change their images.
+    `control` says what an action is (types.Action), `sensor` how the cameras change their images,
+    `environment` which library runs it; "" is ours.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Suite:
     tasks: tuple[Task, ...]
     control: Literal["ee", "joint"] = "ee"
     sensor: Sensor = PERFECT
+    environment: str = ""
 
     def task(self, name: str) -> Task:
         """The task called `name`. Raises: UnknownName."""
