@@ -17,7 +17,7 @@ from tests.test_stills import COMMITTED
 from vap_core.cli import app
 from vap_core.contracts import plugin
 from vap_core.perception.stacks import STACKS, check_stack
-from vap_core.simulation.suites import SUITES
+from vap_core.simulation.suites import ELSEWHERE, SUITES
 from vap_core.study import methods
 from vap_core.study.methods import known_methods
 
@@ -93,7 +93,12 @@ def find_command(words: list[str]) -> tuple[Any, list[str]]:
 def check_names(values: dict[str, object]) -> None:
     """Suites, methods and stacks exist; words in capitals, and Python files, stand for any."""
     methods = set(known_methods())
-    known = {"suite": {*SUITES, "all"}, "methods": methods, "method": methods, "stack": {*STACKS}}
+    known = {
+        "suite": {*SUITES, *ELSEWHERE, "all"},
+        "methods": methods,
+        "method": methods,
+        "stack": {*STACKS},
+    }
     for option, names in known.items():
         given = values.get(option) or ()
         for text in (given,) if isinstance(given, str) else given:
