@@ -17,6 +17,7 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 
 from vap_core.base.errors import BadEndpoint, BadMessage, BadPlan, BadPolicy, first_line, one_of
+from vap_core.environments import AnyScene, open_env
 from vap_core.policies.names import is_served, policy_label
 from vap_core.policies.protocol import TEXT, Chunk, PolicyInput, report_input
 from vap_core.policies.wire_map import WireMap, load_map
@@ -31,8 +32,6 @@ from vap_core.policies.wires import (
     decoded,
     wire_of,
 )
-from vap_core.simulation.env import Env
-from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites.suite import Suite
 
 if TYPE_CHECKING:
@@ -211,11 +210,11 @@ class Served:
     Raises: BadEndpoint: the server is not there; BadPolicy: it and the map do not fit the suite.
     """
 
-    def __init__(self, address: Address, scene: Scene, suite: Suite) -> None:
+    def __init__(self, address: Address, scene: AnyScene, suite: Suite) -> None:
         self.address = address
         self.label = address.label
         self.execute = 1 if address.wire.by_step else address.map.execute
-        self._names = Env(scene, control=suite.control).action_names
+        self._names = open_env(scene, suite.cameras, control=suite.control).action_names
         self._down = scene.robot.down_base
         connection = Connection(address)
         connection.close()
@@ -246,6 +245,6 @@ class Served:
         return list(states), chunks
 
 
-def served_for_suite(name: str, scene: Scene, suite: Suite) -> Served:
+def served_for_suite(name: str, scene: AnyScene, suite: Suite) -> Served:
     """The policy at an address. Raises: as `Served`; UnknownName, BadPolicy for the address."""
     return Served(parse_address(name), scene, suite)
