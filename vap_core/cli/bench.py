@@ -669,7 +669,7 @@ def bench(
             help="step: the prompted control loop, a recording, a query; profile: a control step "
             "of eval by part; scale: cost against cameras, image size, candidates, batch, workers "
             "and Ray; eval: our loop against lerobot's own; stack: a stack's models; policy: the "
-            "shipped policies."
+            "shipped policies; proxy: what the prompting proxy adds to a call of a policy server."
         ),
     ] = "step",
     stack: StackName = "foundation",
@@ -697,8 +697,23 @@ def bench(
     """
     from vap_core.base.errors import one_of
 
+    if what == "proxy":
+        from vap_core.serve import latency
+        from vap_core.study.table import printed
+
+        machine = provenance()
+        print(f"{machine['machine']}, {machine['commit']}")
+        with tempfile.TemporaryDirectory() as scratch:
+            for measured in (latency.alone, latency.between):
+                rows = measured(Path(scratch), quick)
+                cells = [
+                    [f"{v:.1f}" if isinstance(v, float) else str(v) for v in row.values()]
+                    for row in rows
+                ]
+                print("\n" + printed([list(rows[0]), *cells]))
+        return
     if what not in BENCHES:
-        raise one_of("bench:", what, BENCHES)
+        raise one_of("bench:", what, [*BENCHES, "proxy"])
     more: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ended:
         if what == "stack":
