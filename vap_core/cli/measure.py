@@ -8,6 +8,7 @@ import typer
 
 from vap_core.cli.command import (
     Publish,
+    RandomSeed,
     RunFolder,
     RunFolderOr,
     StackName,
@@ -20,8 +21,8 @@ from vap_core.cli.command import (
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Measure one part: perception, photos, objects, parsers, policy, tokens, embeddings, "
-    "attention, calibration.",
+    help="Measure one part: perception, photos, objects, parsers, policy, obedience, tokens, "
+    "embeddings, attention, calibration.",
 )
 
 
@@ -307,6 +308,33 @@ def eval_policy(
     if out is not None:
         keep(table, out)
         print(f"wrote {out}")
+
+
+@app.command("obedience")
+def eval_obedience(
+    policy: Annotated[
+        str, typer.Option(help="Any policy of eval: ws://HOST:PORT, a checkpoint, mini-pi0.")
+    ],
+    suite: Annotated[str, typer.Option(help="A suite with ground truth.")],
+    stack: StackName = "embedded",
+    seed: RandomSeed = 0,
+    workers: Workers = 2,
+    out: RunFolderOr = None,
+) -> None:
+    """Does a policy obey a tint? True, wrong and no masks on the same 30 to 150 episodes, stopped
+    as soon as it is known; a page with one sentence and two recordings. Interrupted, it goes on.
+
+    Example: python -m vap_core measure obedience --policy ws://gpu:8000?map=bridge
+        --suite simpler-bridge
+    """
+    from vap_core.base.errors import BadStudy
+    from vap_core.policies.names import PRIVILEGED
+    from vap_core.study.obedience import Obedience, run
+
+    if policy in PRIVILEGED:
+        raise BadStudy(f"measure obedience: {policy} sees no pictures; name another policy.")
+    folder = out or Path("data/runs", f"obedience-{suite}")
+    print(run(Obedience(suite, policy, stack, seed), folder, workers=workers))
 
 
 @dataclass(frozen=True)

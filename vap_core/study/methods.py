@@ -232,6 +232,17 @@ ABLATIONS: dict[str, Ablation] = {
         arms={},
         methods=(DEFAULT, "oracle-box", "oracle-mask", "oracle-track", "wrong-mask"),
     ),
+    "obedience": Ablation(
+        question="Does the policy obey the mask that it is shown, however it is drawn?",
+        arms={
+            **{
+                f"obeys-tint-{alpha}": Oracle("mask", prompting=Prompting(form=Tint(alpha)))
+                for alpha in (0.3, 0.8)
+            },
+            "obeys-contour": Oracle("mask", prompting=Prompting(form=Contour())),
+        },
+        methods=("generic", "rewrite-only", "oracle-mask", "wrong-mask"),
+    ),
     "tint-share": Ablation(
         question="How much of the gain was taught by tints in the policy's training?",
         arms={},
