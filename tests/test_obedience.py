@@ -71,7 +71,7 @@ def test_waves_are_disjoint_and_every_arm_has_the_same_episodes() -> None:
 def test_the_command_answers_in_a_sentence_with_a_page_and_two_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(obedience, "WAVE", 3)
+    monkeypatch.setattr(obedience, "WAVE", 1)
     monkeypatch.setattr(obedience, "LOOKS", 1)
     words = ("measure", "obedience", "--policy", "scripted", "--suite", "widowx-pick")
     done = vap(*words, "--workers", "1", "--out", tmp_path / "run")

@@ -12,10 +12,10 @@ from vap_core.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {
-    "= vap_core": {"files": 192, "nodes": 239_000, "functions": 2_730},
+    "= vap_core": {"files": 194, "nodes": 241_500, "functions": 2_760},
     "= vap_make": {"files": 66, "nodes": 75_100, "functions": 790},
 }
-COMMANDS, OPTIONS = 21, 230
+COMMANDS, OPTIONS = 21, 235
 
 
 COUNTED = ("files", "code", "nodes", "functions")

@@ -91,8 +91,13 @@ def unknown_words(known: Container[str], instructions: Iterable[str]) -> list[st
     return [word for word in words if word not in known]
 
 
-def unknown_words_notes(study: Study) -> list[str]:
-    """A line for each suite whose instructions have such words. Raises: BadPolicy."""
+def policy_notes(study: Study) -> list[str]:
+    """A line for each suite whose instructions have such words; of a served policy, what is sent
+    and received. Raises: BadPolicy."""
+    if is_served(study.policy):
+        from vap_core.policies.served import parse_address
+
+        return [f"{study.policy}: {'; '.join(parse_address(study.policy).map.lines())}"]
     lines = []
     for suite in dict.fromkeys(suite for suite, _ in study.tasks):
         checkpoint = study.checkpoint(suite)
@@ -341,7 +346,7 @@ def run(
     own_files = suites.own_files(suite for suite, _ in study.tasks)
     if own_files:
         write_atomic(folder / suites.own.FILES, ":".join(own_files).encode())
-    for line in unknown_words_notes(study):
+    for line in policy_notes(study):
         print(line, file=sys.stderr)
     with store.locked(folder):
         store.sweep(folder)
