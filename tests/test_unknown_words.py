@@ -1,7 +1,7 @@
 """A run says which words of its instructions its mini-pi0 does not know."""
 
 from vap_core.simulation import suites
-from vap_core.study.engine import unknown_words, policy_notes
+from vap_core.study.engine import policy_notes, unknown_words
 from vap_core.study.trials import Study
 
 
