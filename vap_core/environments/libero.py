@@ -10,7 +10,7 @@ import os
 import time
 import warnings
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
@@ -73,9 +73,14 @@ PICTURE_PX = 1024
 KINDS = {
     **dict.fromkeys(("red_coffee_mug", "porcelain_mug", "white_yellow_mug"), "mug"),
     "plate": "plate",
+    **dict.fromkeys(("ketchup", "bbq_sauce", "salad_dressing"), "bottle"),
+    **dict.fromkeys(("alphabet_soup", "tomato_sauce"), "can"),
+    **dict.fromkeys(("milk", "orange_juice"), "carton"),
+    **dict.fromkeys(("cream_cheese", "butter", "chocolate_pudding"), "box"),
+    "basket": "basket",
 }
 """What the objects of the lists are, by LIBERO's name of their kind."""
-LYING = frozenset[str]()
+LYING = frozenset("ketchup salad_dressing alphabet_soup tomato_sauce milk orange_juice".split())
 """Kinds whose models have y upwards; all others z."""
 
 
@@ -94,28 +99,42 @@ class Personal:
     place: str
     predicate: str = "on"
 
+    @property
+    def goal(self) -> str:
+        return self.place.removesuffix("_contain_region")
+
 
 def _each(
-    name: str, problem: str, category: str, where: str, place: str, targets: Mapping[str, str]
+    name: str, problem: str, category: str, where: str, place: str, *targets: str
 ) -> tuple[Personal, ...]:
-    """One task for each look-alike of a scene, `targets` by short name."""
-    words = f"put my {category} {where}"
-    return tuple(
-        Personal(f"{short}-{name}", problem, category, words, target, place)
-        for short, target in targets.items()
-    )
+    """One task for each look-alike of a scene."""
+    words, predicate = f"put my {category} {where}", "in" if "region" in place else "on"
+    made = []
+    for target in targets:
+        short = target.removesuffix("_1").replace("_", "-")
+        made.append(Personal(f"{short}-{name}", problem, category, words, target, place, predicate))
+    return tuple(made)
 
 
-_MUGS = {
-    "red-mug": "red_coffee_mug_1",
-    "white-mug": "porcelain_mug_1",
-    "yellow-mug": "white_yellow_mug_1",
-}
+def _groceries(scene: str, category: str, *targets: str) -> tuple[Personal, ...]:
+    problem = f"libero_object/pick_up_the_{scene}_and_place_it_in_the_basket"
+    region = "basket_1_contain_region"
+    return _each("basket", problem, category, "in the basket", region, *targets)
+
+
+_RED, _WHITE, _YELLOW = "red_coffee_mug_1", "porcelain_mug_1", "white_yellow_mug_1"
 _ROOM5 = "libero_90/LIVING_ROOM_SCENE5_put_the_red_mug_on_the_left_plate"
+_ROOM6 = "libero_90/LIVING_ROOM_SCENE6_put_the_red_mug_on_the_plate"
 PERSONAL: dict[str, tuple[Personal, ...]] = {
     "libero-personal": (
-        *_each("left", _ROOM5, "mug", "on the left plate", "plate_1", _MUGS),
-        *_each("right", _ROOM5, "mug", "on the right plate", "plate_2", _MUGS),
+        *_each("left", _ROOM5, "mug", "on the left plate", "plate_1", _RED, _WHITE, _YELLOW),
+        *_each("right", _ROOM5, "mug", "on the right plate", "plate_2", _RED, _WHITE, _YELLOW),
+        *_each("plate", _ROOM6, "mug", "on the plate", "plate_1", _RED, _WHITE),
+        *_groceries("ketchup", "bottle", "ketchup_1", "bbq_sauce_1", "salad_dressing_1"),
+    ),
+    "libero-personal-dev": (
+        *_groceries("alphabet_soup", "can", "alphabet_soup_1", "tomato_sauce_1"),
+        *_groceries("milk", "carton", "milk_1", "orange_juice_1"),
     ),
 }
 SUITES = {
@@ -125,7 +144,7 @@ SUITES = {
         hz=HZ,
         cameras=CAMERAS,
         tasks=tuple(
-            Task(each.name, each.category, each.instruction, MAX_STEPS, "official", each.place)
+            Task(each.name, each.category, each.instruction, MAX_STEPS, "official", each.goal)
             for each in tasks
         ),
         environment="libero",
@@ -302,12 +321,11 @@ class LiberoWorld:
         env.sim.set_state_from_flattened(initial_states(self.personal.problem)[0])
         env.sim.forward()
         target = data.body(self.bodies[self.personal.target])
-        above = target.xpos + np.array([0.0, 0.0, 0.3])
-        groups = (np.arange(6) == COLLISION).astype(np.uint8)
+        groups = np.isin(np.arange(6), (COLLISION, VISUAL)).astype(np.uint8)
         found, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
-        depth = mujoco.mj_ray(model, data, above, down, groups, 1, target.id, found)
+        depth = mujoco.mj_ray(model, data, target.xpos, down, groups, 1, target.id, found)
         base = data.body("robot0_base").xpos
-        return np.array([base[0], base[1], above[2] - depth])
+        return np.array([base[0], base[1], target.xpos[2] - depth])
 
     def _simulator(self) -> Simulator:
         """One more. Where its fixtures stand is drawn from the same seed each time."""

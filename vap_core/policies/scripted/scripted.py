@@ -356,8 +356,10 @@ class Motion:
     empty: float = 0.08
     """A closed gripper that reads less than this holds nothing: try again."""
     rim_m: float = 0.0
-    """How far from its axis a RIMMED thing is grasped, on the far side, with the hand turned by a
-    quarter; 0 where it fits between the fingers."""
+    """How far from its axis a RIMMED thing is grasped, on the far side; 0 where it fits between the
+    fingers."""
+    turn_rad: float = 0.0
+    """How far the hand is turned before it grasps."""
     speed_m_s: float = SPEED_M_S
     follow: float = 1.0
     """The share of what one action asks for that the arm does within it."""
@@ -369,7 +371,14 @@ MOTIONS = {
     "google": Motion(thick_m=0.035, hover_m=0.20, close_s=1.4, arrived_m=0.02),
     "so101": Motion(thick_m=0.028, hover_m=0.13, lift_m=0.09, close_s=0.6, beside_m=0.04),
     "libero": Motion(
-        thick_m=0.05, hover_m=0.24, lift_m=0.16, empty=0.02, rim_m=0.042, speed_m_s=1.0, follow=0.22
+        thick_m=0.05,
+        hover_m=0.24,
+        lift_m=0.16,
+        empty=0.02,
+        rim_m=0.042,
+        turn_rad=np.pi / 2,
+        speed_m_s=1.0,
+        follow=0.22,
     ),
 }
 SHIPPED_MOTIONS: Mapping[str, Motion] = MappingProxyType(dict(MOTIONS))
@@ -486,8 +495,8 @@ class Scripted:
             delta *= min(1.0, longest / max(float(np.linalg.norm(delta)), 1e-9))
             hand = hand + self.motion.follow * delta
             turn = 0.0
-            if self._rim_m(command):
-                turn = float(np.clip(GAIN * (np.pi / 2 - yaw), -MOST_RAD, MOST_RAD))
+            if self.motion.turn_rad:
+                turn = float(np.clip(GAIN * (self.motion.turn_rad - yaw), -MOST_RAD, MOST_RAD))
                 yaw += self.motion.follow * turn
             if self.control == "ee":
                 rows.append([*delta, 0.0, 0.0, turn, opening])
