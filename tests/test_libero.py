@@ -1,12 +1,14 @@
 """Environments of other libraries, through the protocol that our own keeps too."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vap_core.base.errors import MissingPart
+from vap_core.base.errors import BadStudy, MissingPart
 from vap_core.environments import AnyScene, Environment, World, libero, open_env, open_world
 from vap_core.policies.scripted.scripted import PlacedScripted, TruePlaces
 from vap_core.rollout.loop import Trial, rollout
@@ -16,11 +18,11 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites.open_row import build_scene, models_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Truth
-from vap_core.study.trials import make_policy
+from vap_core.study.trials import Study, make_policy, make_trial
 
 THERE = find_spec("libero") is not None
 needs_libero = pytest.mark.skipif(not THERE, reason="LIBERO is absent: make libero")
-TASK = ("libero-personal", "red-mug-left")
+TASK = ("libero-personal", "red-coffee-mug-left")
 LISTED = [("widowx-pick", "pick-straw-cup"), pytest.param(*TASK, marks=needs_libero)]
 NOTHING = Truth({}, {}, (), {}, {})
 
@@ -111,3 +113,57 @@ def test_the_expert_and_the_scripted_policy_reach_the_official_goal() -> None:
     scripted = PlacedScripted(scene.robot, suite.hz, camera, scene.sizes_m)
     assert isinstance(scripted.localizer, TruePlaces)
     scene.close()
+
+
+PUSHER = """
+from vap_core.environments.gym import Map
+
+MAP = Map(
+    name="pusher",
+    id="Pusher-v5",
+    category="puck",
+    target="my-puck",
+    instruction="push my puck to the goal",
+    hz=20.0,
+    max_steps=4,
+    images={"front": lambda seen, drawn: drawn},
+    state=lambda seen: seen,
+    success=lambda reward, ended, info: info["reward_dist"] > -0.1,
+    episodes=2,
+)
+SUITE, rows = MAP.suite(), MAP.rows
+"""
+
+
+@pytest.fixture
+def pusher(tmp_path: Path) -> Iterator[Study]:
+    """Gymnasium's own environment, which knows nothing of objects."""
+    pytest.importorskip("imageio", reason="Gymnasium's MuJoCo environments draw with imageio")
+    file = tmp_path / "pusher.py"
+    file.write_text(PUSHER)
+    yield Study((("pusher", "puck"),), ("generic",), policy="random", suite_files=(str(file),))
+    del suites.own.OPENED["pusher"]
+
+
+def test_any_gymnasium_environment_is_a_suite(pusher: Study, tmp_path: Path) -> None:
+    rows = pusher.rows("pusher", "puck")
+    trial = make_trial(pusher, rows, "generic", tmp_path)
+    assert isinstance(trial.scene, World)
+    first, again = (list(rollout(trial, rows, keep_images=True)) for _ in range(2))
+    for episode, same in zip(first, again, strict=True):
+        assert episode.outcome.status == "failure"
+        assert episode.outcome.cmr is episode.outcome.wrong_object is None
+        assert [frame.images["front"].shape for frame in episode.frames] == [(256, 256, 3)] * 5
+        assert np.array_equal(episode.frames[-1].state, same.frames[-1].state)
+    assert not np.array_equal(first[0].frames[0].state, first[1].frames[0].state)
+
+
+def test_what_needs_ground_truth_says_so(pusher: Study, tmp_path: Path) -> None:
+    rows = pusher.rows("pusher", "puck")
+    trial = make_trial(pusher, rows, "generic", tmp_path)
+    prompter = generic()
+    prompter.needs_truth = "start"
+    with pytest.raises(BadStudy, match="pusher has no ground truth"):
+        list(rollout(replace(trial, prompter=prompter), rows, keep_images=True))
+    with pytest.raises(BadStudy, match="no scripted motion"):
+        make_trial(replace(pusher, policy="expert"), rows, "generic", tmp_path)

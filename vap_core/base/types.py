@@ -351,10 +351,11 @@ class Attended:
 @value
 class Camera:
     """A calibrated pinhole camera: `k` in pixels; `pose_world` maps camera (OpenCV axes) to world,
-    4 x 4."""
+    4 x 4, where z = 0 is the table. Of one that is not `calibrated` both are made up."""
 
     name: str
     width: int
     height: int
     k: Float64[np.ndarray, "3 3"]
     pose_world: Float64[np.ndarray, "4 4"]
+    calibrated: bool = True

@@ -3,10 +3,10 @@
 Our own simulator's is `simulation.env.Env`. A suite names its environment (Suite.environment).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from vap_core.environments import libero
+from vap_core.environments import gym, libero
 from vap_core.environments.protocol import Environment as Environment
 from vap_core.environments.protocol import World as World
 from vap_core.simulation import suites
@@ -16,7 +16,10 @@ from vap_core.simulation.scenes import Scene
 from vap_core.simulation.types import EpisodeRow
 
 type AnyScene = Scene | World
-WORLDS = {"libero": libero.LiberoWorld}
+WORLDS: dict[str, Callable[[EpisodeRow], World]] = {
+    "libero": libero.LiberoWorld,
+    "gym": gym.GymWorld,
+}
 """How the world of some rows of one task is made, by the name of its environment."""
 suites.ELSEWHERE.update(libero.SUITES)
 objects.MAKERS.append(libero.find_object)

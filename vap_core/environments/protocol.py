@@ -19,8 +19,8 @@ class Environment(Protocol):
     a gripper's opening 0..1 (simulation.types); an adapter converts. `seconds` sums wall time by
     part ("render", ...). `truth` is empty but for `succeeded` where the environment knows no more:
     consumers that need masks, contacts or poses say that they are absent. The frame of all poses
-    has z = 0 on the table top; `cameras` is empty where they are not calibrated in such a frame, so
-    that association refuses.
+    has z = 0 on the table top; cameras that are not calibrated in such a frame say so, and
+    association refuses them.
     """
 
     hz: float

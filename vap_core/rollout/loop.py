@@ -320,7 +320,7 @@ def _context(trial: Trial, episode: RunningEpisode) -> PromptContext:
             )
         judge = episode.judge
         truth = SceneTruth(episode.goal, masks, step=judge.steps, moved=judge.moved)
-    cameras = {camera.name: camera for camera in episode.env.cameras()}
+    cameras = {each.name: each for each in episode.env.cameras() if each.calibrated}
     return PromptContext(episode.goal.instruction, cameras, truth, episode.env.look)
 
 

@@ -62,27 +62,32 @@ def read_states(folder: Path) -> Iterator[tuple[tuple[Any, ...], list[Truth]]]:
 
 
 def _to_row(episode: Episode) -> dict[str, Any]:
-    names = [place.model for place in episode.header.row.placements]
     truths = [frame.truth for frame in episode.frames]
+    names = [place.model for place in episode.header.row.placements if truths[0].objects_world]
+    poses = [truth.objects_world[name] for truth in truths for name in names]
+    official = episode.header.row.rule == "official"
     return {
         **dict(zip(KEY, episode.key, strict=True)),
         "objects": names,
-        "poses": np.concatenate([truth.objects_world[name] for truth in truths for name in names]),
+        "poses": np.concatenate([*poses, np.zeros(0)]),
         "touched": [list(truth.touched) for truth in truths],
         "pressed": [[f"{n}={s!r}" for n, s in truth.pressed_s.items()] for truth in truths],
         "contacts": [
             [f"{name}={other}" for name in sorted(met) for other in sorted(met[name])]
             for met in (truth.contacts for truth in truths)
         ],
+        **({"succeeded": [truth.succeeded for truth in truths]} if official else {}),
     }
 
 
 def _truths(row: Mapping[str, Any]) -> list[Truth]:
     names = list(row["objects"])
-    poses = np.asarray(row["poses"], np.float64).reshape(-1, len(names), 7)
+    steps = len(row["touched"])
+    poses = np.asarray(row["poses"], np.float64).reshape(steps, len(names), 7)
+    succeeded = row["succeeded"] if row.get("succeeded") is not None else [False] * steps
     truths = []
-    for step, touched, *texts in zip(
-        poses, row["touched"], row["pressed"], row["contacts"], strict=True
+    for step, touched, done, *texts in zip(
+        poses, row["touched"], succeeded, row["pressed"], row["contacts"], strict=True
     ):
         pressed, contacts = ([text.rsplit("=", 1) for text in each] for each in texts)
         met = {name: frozenset(o for n, o in contacts if n == name) for name, _ in contacts}
@@ -92,6 +97,7 @@ def _truths(row: Mapping[str, Any]) -> list[Truth]:
             touched=tuple(touched),
             pressed_s={name: float(seconds) for name, seconds in pressed},
             contacts=met,
+            succeeded=bool(done),
         )
         truths.append(truth)
     return truths

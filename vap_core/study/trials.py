@@ -88,6 +88,11 @@ def make_policy(
     name: str, scene: AnyScene, suite: Suite, stack: Stack | None
 ) -> Policy[Any] | PrivilegedPolicy[Any]:
     """One of `POLICIES`; only the scripted one needs a stack. Raises: UnknownName."""
+    if suite.environment == "gym" and name != "random":
+        raise BadStudy(
+            f"Study: {suite.name} has no scripted motion; take --policy random, a checkpoint or a "
+            "server."
+        )
     match name:
         case "scripted":
             assert stack is not None, "the scripted policy needs a detector"

@@ -4,11 +4,13 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields, is_dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vap_core.environments import gym
 from vap_core.policies.scripted.scripted import MOTIONS, SHIPPED_MOTIONS
 from vap_core.simulation import robots, suites
 from vap_core.simulation.assets.objects import ObjectModel, get_object
@@ -59,6 +61,9 @@ def digest(listed: Sequence[tuple[str, Sequence[EpisodeRow]]], edition: str = ""
     for suite, rows in listed:
         known = suites.suite(suite)
         robot = robots.get(known.robot)
+        if known.environment == "gym":
+            found.update(_canonical((known, gym.MAPS[suite].id, version("gymnasium"))))
+            continue
         models = [get_object(name) for name in sorted(models_of(rows))]
         found.update(_canonical((known, robot, models)) + robot.xml.read_bytes())
         for name, file in mjcf.other_files(robot).items():

@@ -21,7 +21,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.control import LEAD_JOINT_RAD, arm
 from vap_core.simulation.env import Env
 from vap_core.simulation.robots import Robot
-from vap_core.simulation.types import Pose
+from vap_core.simulation.types import EE_ACTION, Pose
 
 KEEP = 0.8
 """Share of one action that goes on in the next."""
@@ -48,21 +48,26 @@ class Random:
         return RandomState(rng, np.zeros(0, np.float32))
 
     def plan_from_simulation(
-        self, states: Sequence[RandomState], envs: Sequence[Env]
+        self, states: Sequence[RandomState], envs: Sequence[Any]
     ) -> tuple[list[RandomState], list[Chunk]]:
         after = []
         chunks = []
         for state, env in zip(states, envs, strict=True):
             rng = copy.deepcopy(state.rng)
             # A share of the last draw and fresh noise, by the deviation of every number.
-            last = state.last if len(state.last) else np.zeros(env.action_size, np.float32)
-            rates = [JOINT_RAD_S] * (env.action_size - 1)
-            if env.control == "ee":
-                rates = [MOVE_M_S] * 3 + [TURN_RAD_S] * 3
-            scales = np.array([*(rate / env.hz for rate in rates), 1.0])
-            fresh = rng.standard_normal(env.action_size) * scales
+            n = len(env.action_names)
+            last = state.last if len(state.last) else np.zeros(n, np.float32)
+            scales = np.ones(n)
+            if env.action_names == EE_ACTION:
+                scales[:-1] = np.repeat([MOVE_M_S, TURN_RAD_S], 3) / env.hz
+            elif isinstance(env, Env):
+                scales[:-1] = JOINT_RAD_S / env.hz
+            fresh = rng.standard_normal(n) * scales
             drawn = (KEEP * last + np.sqrt(1 - KEEP**2) * fresh).astype(np.float32)
             after.append(RandomState(rng, drawn))
+            if env.action_names[-1] != "gripper":
+                chunks.append(drawn[None])
+                continue
             # The gripper is as often nearly closed as nearly open.
             gripper = np.clip(0.5 + drawn[-1], 0.0, 1.0)
             chunks.append(np.array([[*drawn[:-1], gripper]], np.float32))

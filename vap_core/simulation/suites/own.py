@@ -150,22 +150,28 @@ def _check_home(robot: Robot, model: Any) -> None:
             )
 
 
+def _check_robot(suite: Suite) -> None:
+    """Raises: BadSuite, UnknownName: the suite does not fit its robot."""
+    robot = robots.get(suite.robot)
+    if suite.hz != robot.hz:
+        raise BadSuite(f"{robot.name} is controlled at hz={robot.hz:g}, and not {suite.hz:g}")
+    spec = mjcf.load(robot)
+    rigs = add_rigs(spec, robot.name)
+    _check_home(robot, spec.compile())
+    if not suite.cameras:
+        raise BadSuite(f"cameras is empty; {robot.name} has {', '.join(sorted(rigs))}")
+    for camera in suite.cameras:
+        if camera not in rigs:
+            raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
+
+
 def _checked_rows(
     suite: Suite, make_rows: Callable[[], object], path: Path
 ) -> tuple[EpisodeRow, ...]:
     """The suite's list, once it names only what exists. Raises: BadSuite."""
     try:
-        robot = robots.get(suite.robot)
-        if suite.hz != robot.hz:
-            raise BadSuite(f"{robot.name} is controlled at hz={robot.hz:g}, and not {suite.hz:g}")
-        spec = mjcf.load(robot)
-        rigs = add_rigs(spec, robot.name)
-        _check_home(robot, spec.compile())
-        if not suite.cameras:
-            raise BadSuite(f"cameras is empty; {robot.name} has {', '.join(sorted(rigs))}")
-        for camera in suite.cameras:
-            if camera not in rigs:
-                raise one_of(f"suite {suite.name}: camera", camera, sorted(rigs))
+        if not suite.environment:
+            _check_robot(suite)
         for task in suite.tasks:
             check_wording(task)
         names = [task.name for task in suite.tasks]
@@ -184,6 +190,8 @@ def _checked_rows(
         keys = [row.key for row in rows]
         for i, row in enumerate(rows):
             suite.task(row.task)
+            if suite.environment:
+                continue
             first, *_ = [objects.get_object(place.model) for place in row.placements]
             if first.category != row.category:
                 raise BadSuite(
