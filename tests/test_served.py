@@ -26,7 +26,7 @@ from vap_core.policies import served
 from vap_core.policies.protocol import PolicyInput
 from vap_core.policies.served import Connection, parse_address
 from vap_core.policies.wire_map import MAPS
-from vap_core.policies.wires import TOKEN, WIRES, Message, array_of, decoded, node_of, pack, unpack
+from vap_core.policies.wires import TOKEN, WIRES, Message, decoded, node_of, pack, unpack
 from vap_core.rollout.prompters import unchanged
 from vap_core.serve.proxy import Keeper, Options, Proxy, find_pictures
 from vap_core.serve.records import Records
@@ -559,6 +559,25 @@ def test_records_are_recordings_and_rows_to_query(
     assert "nothing personal: passed as it is" in said
 
 
+def test_names_and_texts_from_outside_reach_no_terminal_and_stop_no_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    about = {"method": "vap", "policy": "ws://127.0.0.1:1", "wire": "openpi"}
+    with proxied(Records(tmp_path / "run", MEMORY, about)) as (_, client):
+        socket = client()
+        for name in ("a b/\x1b[2J", "../..", "\udcff", ""):
+            ask(socket, {f"observation/{name}": line(), "prompt": f"bring my cup \x1b]0;{name}"})
+        for n in range(70):
+            answer = ask(socket, {"image": line(), "prompt": COMMAND, "session_id": str(n)})
+        assert "over 64 sessions" in answer
+        socket.close()
+        time.sleep(0.5)
+    said = capsys.readouterr().err
+    assert "nothing more is recorded" not in said
+    assert len(store.read(tmp_path / "run")) == 4 + 63
+    assert "\x1b" not in "".join(store.read(tmp_path / "run")["instruction"])
+
+
 def test_a_thousand_faults_tint_no_wrong_episode_and_pass_nothing_in_silence() -> None:
     """Whatever a client sends, the server behind gets what the method itself gives, or nothing."""
     rng, models = np.random.default_rng(7), attender()
@@ -582,7 +601,8 @@ def test_a_thousand_faults_tint_no_wrong_episode_and_pass_nothing_in_silence() -
             try:
                 got = decoded(unpack(bytes(frame)))
                 pictures = find_pictures(unpack(bytes(frame)))
-                ((_, (_, pixels)),) = pictures.items()
+                ((_, picture),) = pictures.items()
+                pixels = picture.rgb
                 said = next(got[k] for k in ("prompt", "task") if isinstance(got.get(k), str))
                 (name,) = (path[-1].rpartition("/")[2] for path in pictures)
                 if text != said:
@@ -610,9 +630,8 @@ def test_a_thousand_faults_tint_no_wrong_episode_and_pass_nothing_in_silence() -
         assert 300 < refused < 800
         for frame, (said, pixels) in zip(upstream.frames, wanted, strict=True):
             payload = unpack(frame)
-            ((_, (node, shown)),) = find_pictures(payload).items()
-            assert_array_equal(shown, pixels)
-            assert array_of(node).dtype == np.uint8
+            ((_, shown),) = find_pictures(payload).items()
+            assert_array_equal(shown.rgb, pixels)
             assert said in payload.values()
             assert "my cup" not in said.lower()
 

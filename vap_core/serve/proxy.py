@@ -7,6 +7,7 @@ personal object passes untouched.
 """
 
 import asyncio
+import re
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,9 +23,10 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from vap_core.attend import Attender, AttendState
 from vap_core.base.errors import BadMessage, NothingPersonal, first_line
-from vap_core.base.types import Attended, Event, Track, Views
-from vap_core.policies.wire_map import is_picture
+from vap_core.base.types import Attended, Event, Rgb, Track, Views
 from vap_core.policies.wires import (
+    ARRAY,
+    IMAGE,
     LARGEST_MESSAGE,
     UPSTREAM_TOKEN,
     Frame,
@@ -47,6 +49,7 @@ TRIES_S = (0.5, 1.0, 2.0)
 """The waits between attempts to reach the server behind."""
 SMALLEST_PX = 16
 """A smaller array of three channels is no picture."""
+MOST_SESSIONS = 64
 MOST_NUMBERS = 64
 """Longer vectors of numbers are no robot's state."""
 NEARER = 6.0
@@ -132,10 +135,9 @@ class Stream:
             `Attender.step`.
         """
         began = time.perf_counter()
-        nodes = find_pictures(payload, self._cameras)
-        views = {"/".join(path): rgb for path, (_, rgb) in nodes.items()}
-        names = _camera_names(list(nodes))
-        views = {names[path]: rgb for path, (_, rgb) in nodes.items()}
+        pictures = find_pictures(payload, self._cameras)
+        names = _camera_names(list(pictures))
+        views = {names[path]: picture.rgb for path, picture in pictures.items()}
         text_path, text = find_text(payload)
         vector = state_vector(payload)
         read = time.perf_counter()
@@ -158,10 +160,10 @@ class Stream:
         prompted = time.perf_counter()
         if attended.text != text:
             payload = put(payload, text_path, attended.text)
-        for path, (node, rgb) in nodes.items():
+        for path, picture in pictures.items():
             shown = attended.images[names[path]]
-            if shown is not rgb and (shown != rgb).any():
-                payload = put(payload, path, _as_sent(node, shown))
+            if shown is not picture.rgb and (shown != picture.rgb).any():
+                payload = put(payload, path, picture.showing(shown))
         done = time.perf_counter()
         seconds = {"decode": read - began, "attend": prompted - read, "encode": done - prompted}
         kept = Prompted(episode.number, episode.call, text, views, attended, vector, why, seconds)
@@ -212,23 +214,35 @@ class Stream:
         episode.before = views, attended
 
 
-def find_pictures(
-    payload: Mapping[Any, Any], cameras: tuple[str, ...] = ()
-) -> dict[Path, tuple[Any, np.ndarray]]:
-    """Every colour picture of a payload: its path, the map that stands for it, and its pixels.
+@dataclass(frozen=True)
+class Picture:
+    """A colour picture: the map that stands for it, its array as it came, and its pixels."""
+
+    node: Any
+    array: np.ndarray
+    rgb: Rgb
+
+    def showing(self, rgb: Rgb) -> Any:
+        """The map for other pixels, in the form in which the client sent these."""
+        in_order = rgb if self.array.shape[-1] == 3 else rgb.transpose(2, 0, 1)
+        return like(self.node, np.ascontiguousarray(in_order).reshape(self.array.shape))
+
+
+def find_pictures(payload: Mapping[Any, Any], cameras: tuple[str, ...] = ()) -> dict[Path, Picture]:
+    """Every colour picture of a payload, by its path.
 
     Those are arrays of uint8 with three channels, first or last, and encoded pictures; `cameras`
     names the paths (a/b) of those that are meant, where that is not all.
 
     Raises: BadMessage: there is none; one is not of uint8, or is of several moments.
     """
-    found: dict[Path, tuple[Any, np.ndarray]] = {}
+    found: dict[Path, Picture] = {}
     for path, part in leaves(payload):
         name = "/".join(path)
         if cameras and name not in cameras:
             continue
         nodes = part if isinstance(part, list) else [part]
-        if not any(marked(node) in ("__ndarray__", "__image__") for node in nodes):
+        if not any(marked(node) in (ARRAY, IMAGE) for node in nodes):
             continue
         arrays = [array_of(node) for node in nodes if marked(node)]
         pixels = [array for array in arrays if _looks_coloured(array)]
@@ -243,7 +257,7 @@ def find_pictures(
                 f"proxy: {name} is a picture of {pixels[0].dtype}; send uint8, or name the "
                 "cameras that are meant (--camera KEY)."
             )
-        found[path] = part, _upright(pixels[0])
+        found[path] = Picture(part, pixels[0], _upright(pixels[0]))
     for name in cameras:
         if name not in {"/".join(path) for path in found}:
             raise BadMessage(f"proxy: there is no picture {name} in this message (--camera).")
@@ -268,14 +282,6 @@ def _upright(array: np.ndarray) -> np.ndarray:
     return one if one.shape[2] == 3 else np.ascontiguousarray(one.transpose(1, 2, 0))
 
 
-def _as_sent(node: Any, rgb: np.ndarray) -> Any:
-    """A picture in the form in which the client sent it."""
-    shape = array_of(node).shape
-    if not is_picture(rgb) or shape != rgb.shape:
-        rgb = rgb if shape[-1] == 3 else np.ascontiguousarray(rgb.transpose(2, 0, 1))
-    return like(node, rgb.reshape(shape))
-
-
 def find_text(payload: Mapping[Any, Any]) -> tuple[Path, str]:
     """Where the command is, and what it is. Raises: BadMessage."""
     for name in TEXTS:
@@ -292,7 +298,7 @@ def state_vector(payload: Mapping[Any, Any]) -> np.ndarray:
     """The floats of a payload that can be the robot's state, in the order of their paths."""
     parts = []
     for _, part in sorted(leaves(payload), key=lambda leaf: leaf[0]):
-        if marked(part) == "__ndarray__":
+        if marked(part) == ARRAY:
             array = array_of(part)
             if array.dtype.kind == "f" and array.size <= MOST_NUMBERS and array.ndim <= 2:
                 parts.append(array.astype(np.float64).reshape(-1))
@@ -338,14 +344,16 @@ def _untouched(views: Views, text: str) -> Attended:
 
 
 def _camera_names(paths: list[Path]) -> dict[Path, str]:
-    """A short name of every picture: the end of its path, the whole of it where that is no name."""
+    """A name of every picture for logs and recordings: the end of its path, where that is a name
+    of its own; of letters, digits, points and dashes."""
     last = [path[-1].rpartition("/")[2].removeprefix("observation.images.") for path in paths]
-    whole = ["-".join(path).replace("/", "-") for path in paths]
+    last = [re.sub(r"[^\w.-]+", "-", name) or "camera" for name in last]
+    whole = [f"{n}-{name}" for n, name in enumerate(last)]
     unique = len(set(last)) == len(last)
     return dict(zip(paths, last if unique else whole, strict=True))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Options:
     """How a proxy prompts. `dry` prompts nothing."""
 
@@ -372,9 +380,9 @@ class Proxy:
         self, upstream: str, attender: Attender | None, options: Options, keeper: Keeper
     ) -> None:
         self.upstream = upstream
+        self.keeper = keeper
         self._attender = None if options.dry else attender
         self._options = options
-        self._keeper = keeper
         self._episodes = 0
         self._threads = ThreadPoolExecutor(cores(), "attend")
 
@@ -434,14 +442,6 @@ class Proxy:
             new_episode=options.new_episode,
             objects=options.objects,
         )
-
-    @property
-    def keeper(self) -> Keeper:
-        return self._keeper
-
-    @property
-    def dry(self) -> bool:
-        return self._options.dry
 
     async def run[T](self, work: Callable[..., T], *given: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, work, *given)
@@ -503,6 +503,10 @@ class Relay:
     def _stream(self, message: Message) -> Stream:
         session = str(message.payload.get("session_id", ""))
         if session not in self._streams:
+            if len(self._streams) == MOST_SESSIONS:
+                raise BadMessage(
+                    f"proxy: a connection has over {MOST_SESSIONS} sessions; connect anew."
+                )
             self._streams[session] = self._proxy.stream()
         return self._streams[session]
 
@@ -532,7 +536,7 @@ class Relay:
             if message.kind not in ("action", "error"):
                 return
             for _, part in leaves(message.payload):
-                if actions is None and marked(part) == "__ndarray__":
+                if actions is None and marked(part) == ARRAY:
                     actions = np.atleast_2d(array_of(part))
         stream, asked = self._asked.pop(0)
         self._proxy.keeper.answered(stream, actions, time.perf_counter() - asked)

@@ -5,13 +5,14 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from vap_core.base.errors import VapError
+from vap_core.base.errors import first_line, printable
 from vap_core.base.types import Attended, PersonalObject
 from vap_core.recording import DatasetRecorder, recording_file_name
 from vap_core.serve.proxy import Keeper, Prompted, events_of
@@ -56,6 +57,9 @@ class Records(Keeper):
         self._failed = False
 
     def observed(self, stream: object, found: Prompted) -> None:
+        text = printable(found.attended.text)
+        attended = replace(found.attended, text=text)
+        found = replace(found, instruction=printable(found.instruction), attended=attended)
         with self._lock:
             episode = self._under_way.get(stream)
             if episode is None or episode.first.episode != found.episode:
@@ -64,7 +68,7 @@ class Records(Keeper):
                 self._tell_start(found)
             try:
                 self._keep(episode, found)
-            except VapError as error:  # a full disk ends no client's episode
+            except Exception as error:  # what cannot be recorded ends no client's episode
                 self._give_up(error)
 
     def answered(self, stream: object, actions: np.ndarray | None, seconds: float) -> None:
@@ -74,9 +78,9 @@ class Records(Keeper):
                 return
             episode.waited_ms.append(1e3 * seconds)
             call = len(episode.waited_ms) - 1
-            if episode.recorder is not None and actions is not None and actions.size:
+            if episode.recorder is not None and actions is not None and not self._failed:
                 at_s = episode.at_s[min(call, len(episode.at_s) - 1)]
-                row = actions.reshape(-1, actions.shape[-1])[0].astype(np.float64)
+                row = actions.reshape(len(actions), -1)[0].astype(np.float64)
                 episode.recorder.add_numbers(call, at_s, {"/action": row}, ())
 
     def ended(self, stream: object) -> None:
@@ -151,19 +155,19 @@ class Records(Keeper):
             f"episode {episode.first.episode} ends after {len(added)} calls; the proxy added "
             f"{added[0]:.0f} ms to the first{later}"
         )
-        if self._folder is None:
+        if self._folder is None or self._failed:
             return
         try:
             if episode.recorder is not None:
                 episode.recorder.__exit__(None, None, None)
             store.write_part(self._folder, FOLDER, episode.steps, caller="serve")
             store.append(self._folder, [self._row(episode)])
-        except VapError as error:
+        except Exception as error:
             self._give_up(error)
 
-    def _give_up(self, error: VapError) -> None:
+    def _give_up(self, error: Exception) -> None:
         if not self._failed:
-            _say(f"note: nothing more is recorded: {error}")
+            _say(f"note: nothing more is recorded: {first_line(error) or type(error).__name__}")
         self._failed = True
 
     def _key(self, found: Prompted) -> dict[str, Any]:
