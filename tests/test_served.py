@@ -636,6 +636,31 @@ def test_a_thousand_faults_tint_no_wrong_episode_and_pass_nothing_in_silence() -
             assert "my cup" not in said.lower()
 
 
+def test_a_lerobot_checkpoint_of_liberos_shapes_behind_openpis_wire(tmp_path: Path) -> None:
+    """lerobot's PI0 (tiny, random), two cameras, eight numbers of state, OSC's seven of action."""
+    from vap_core.policies.lerobot.adapter import load_policy
+    from vap_core.policies.lerobot.toy_pi0 import Toy, save_toy, toy_sizes
+    from vap_core.rollout import rollout
+    from vap_core.study.trials import Study, make_trial
+
+    toy = Toy(image=32, layers=1, denoise=2)
+    folder = save_toy(tmp_path / "libero", ("image", "image2"), 8, 7, toy)
+    with toy_sizes(toy):
+        policy = load_policy(folder, "cpu")
+        server = PolicyServer(policy, MAPS["libero"], policy.cameras())
+        with ours(server) as port:
+            address = f"ws://127.0.0.1:{port}?map=libero"
+            study = Study((("franka-pick", "pick-cup"),), ("generic",), episodes=1, policy=address)
+            rows = study.rows("franka-pick", "pick-cup")
+            trial = make_trial(study, rows, "generic", tmp_path / "memory")
+            (episode,) = rollout(trial, rows)
+    assert episode.outcome.status != "error", episode.outcome.detail
+    assert episode.header.policy.startswith("openpi:127.0.0.1:")
+    moved = np.stack([frame.action for frame in episode.frames if frame.action is not None])
+    assert moved.shape[1] == 7
+    assert 0 < np.abs(moved[:, :3]).max() < 0.05
+
+
 @pytest.mark.timeout(240)
 def test_the_real_commands_give_what_the_policy_gives_in_process(tmp_path: Path) -> None:
     """eval through the proxy, generic, equals vap in process: episodes, outcomes, steps."""

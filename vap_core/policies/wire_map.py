@@ -74,7 +74,8 @@ class Strict(BaseModel):
 
 
 class Picture(Strict):
-    """A camera's picture: RGB, uint8. `camera` is its name or its number among the suite's.
+    """A camera's picture: RGB, uint8. `camera` is its name, names of which one is there, or its
+    number among the suite's.
 
     `{camera}` in the key stands for every camera's name. `size` is the side of a square, into which
     the picture is scaled and padded with black; None leaves it. `turned`: by 180 degrees. `first`:
@@ -82,7 +83,7 @@ class Picture(Strict):
     """
 
     key: Path
-    camera: str | int = 0
+    camera: int | str | tuple[str, ...] = 0
     size: Annotated[int, Field(ge=16, le=2048)] | None = None
     turned: bool = False
     first: bool = False
@@ -133,14 +134,18 @@ class WireMap(Strict):
                     path = tuple(key.replace("{camera}", name) for key in picture.key)
                     found[name] = path, picture
                 continue
-            names = [*cameras[picture.camera :][:1]] if isinstance(picture.camera, int) else []
-            name = next(iter(names), str(picture.camera))
-            if name not in cameras:
+            wanted = picture.camera
+            if isinstance(wanted, int):
+                there = [*cameras[wanted:][:1]]
+            else:
+                there = [name for name in _alternatives(wanted) if name in cameras]
+            if not there:
                 raise BadPolicy(
-                    f"wire map: {'/'.join(picture.key)} is the picture of camera {name}; this "
-                    f"suite has {', '.join(cameras)}. Take a suite that has it, or map another."
+                    f"wire map: {'/'.join(picture.key)} is the picture of camera "
+                    f"{_camera(picture)}; there is {', '.join(cameras)}. Take a suite that has it, "
+                    "or map another."
                 )
-            found[name] = picture.key, picture
+            found[there[0]] = picture.key, picture
         return found
 
     def request(self, given: PolicyInput, down: np.ndarray) -> dict[Any, Any]:
@@ -228,7 +233,7 @@ class WireMap(Strict):
 
     def lines(self) -> list[str]:
         """The convention in words, a line each."""
-        shown = [f"{'/'.join(p.key)} <- camera {p.camera}" + _form(p) for p in self.pictures]
+        shown = [f"{'/'.join(p.key)} <- camera {_camera(p)}" + _form(p) for p in self.pictures]
         shown += [f"{'/'.join(n.key)} <- {', '.join(n.parts)}" for n in self.state]
         shown += [f"{'/'.join(self.text)} <- the command"]
         return [
@@ -321,6 +326,15 @@ def _formed(rgb: Rgb, picture: Picture) -> np.ndarray:
     return np.ascontiguousarray(rgb.transpose(2, 0, 1) if picture.first else rgb)
 
 
+def _alternatives(camera: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (camera,) if isinstance(camera, str) else camera
+
+
+def _camera(picture: Picture) -> str:
+    camera = picture.camera
+    return str(camera) if isinstance(camera, int) else " or ".join(_alternatives(camera))
+
+
 def _form(picture: Picture) -> str:
     size = "" if picture.size is None else f", {picture.size} x {picture.size}"
     return f"{size}{', turned by 180 degrees' if picture.turned else ''}"
@@ -357,7 +371,7 @@ MAPS: dict[str, WireMap] = {
         about="openpi's LIBERO policies: OSC_POSE of a Panda at 20 Hz",
         pictures=(
             Picture(key=("observation/image",), size=224),
-            Picture(key=("observation/wrist_image",), camera="wrist", size=224),
+            Picture(key=("observation/wrist_image",), camera=("wrist", "image2"), size=224),
         ),
         state=(
             Numbers(key=("observation/state",), parts=("position", "axis-angle", "fingers*0.04")),
