@@ -7,6 +7,7 @@ Every row carries the keys of `View.key`. Boxes that overlap by IoU 0.5 agree.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from functools import cache
 from typing import Any
 
@@ -25,10 +26,12 @@ from vap_core.base.types import (
     likeness,
     value,
 )
+from vap_core.environments import Environment, open_world
 from vap_core.memory import register
 from vap_core.perception.boxes import box_iou, crop, mask_box, mask_iou
 from vap_core.perception.candidates import Proposals, propose
 from vap_core.perception.protocols import Stack
+from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
 from vap_core.simulation.assets.phrases import AMBIGUOUS, UNSEEN
 from vap_core.simulation.studio import reference_views
@@ -102,12 +105,19 @@ def opening_views(rows: Sequence[EpisodeRow], size: int = GROUNDING_PX) -> Itera
 
     Raises: UnknownName for a suite or an object that no registry holds.
     """
-    groups: dict[tuple[str, str], list[EpisodeRow]] = {}
+    groups: dict[tuple[str, str, str], list[EpisodeRow]] = {}
     for row in rows:
-        groups.setdefault((row.suite, row.variant), []).append(row)
-    for (suite, variant), group in groups.items():
-        with build_scene(suite, models_of(group), variant) as scene:
-            env = make_env(scene, suite, image_size=size)
+        task = row.task if suites.suite(row.suite).environment else ""
+        groups.setdefault((row.suite, row.variant, task), []).append(row)
+    for (suite, variant, elsewhere), group in groups.items():
+        env: Environment
+        with ExitStack() as stack:
+            if elsewhere:
+                world = stack.enter_context(closing(open_world(group)))
+                env = world.open(size, world.cameras)
+            else:
+                scene = stack.enter_context(build_scene(suite, models_of(group), variant))
+                env = make_env(scene, suite, image_size=size)
             for row in group:
                 env.reset(row)
                 masks = env.truth(masks=True).masks

@@ -38,6 +38,8 @@ EPISODES = {"simpler-fractal": 30, "simpler-bridge": 16, "vlabench": 8, "tableto
 
 Suites with three cameras need fewer.
 """
+FOREIGN = 6
+"""Opening frames a task of other libraries' suites."""
 QUICK = 2
 """Episodes a task of a quick survey.
 
@@ -85,16 +87,18 @@ class Survey(Measurement):
 
     def __post_init__(self) -> None:
         for name in self.suites:
-            if name not in suites.BENCHMARKS:
-                raise one_of("Survey: suite", name, suites.BENCHMARKS)
+            if name not in (*suites.BENCHMARKS, *suites.ELSEWHERE):
+                raise one_of("Survey: suite", name, (*suites.BENCHMARKS, *suites.ELSEWHERE))
         check_stack(self.stack, "Survey")
 
     def n_openings(self, suite: str) -> int:
         """Opening frames a task."""
-        return self.episodes or (QUICK if self.quick else EPISODES[suite])
+        return self.episodes or (QUICK if self.quick else EPISODES.get(suite, FOREIGN))
 
     def n_tracked(self, suite: str) -> int:
-        """Episodes a task that are tracked to their end."""
+        """Episodes a task that are tracked to their end; our own expert plays them."""
+        if suite in suites.ELSEWHERE:
+            return 0
         usual = 1 if self.quick else tracking.EPISODES[suite]
         return min(usual, self.episodes or usual)
 
@@ -125,10 +129,11 @@ class Survey(Measurement):
         Raises: BadSuite for a damaged list.
         """
         jobs = []
-        tracked = tracking.plan({name: self.n_tracked(name) for name in self.suites}, self.suites)
+        own = tuple(name for name in self.suites if name not in suites.ELSEWHERE)
+        tracked = tracking.plan({name: self.n_tracked(name) for name in own}, own)
         if self.quick:
             first = {job.row.suite: job for job in reversed(tracked)}
-            tracked = [replace(first[name], hidden=(HIDDEN,)) for name in self.suites]
+            tracked = [replace(first[name], hidden=(HIDDEN,)) for name in own]
         for what in tracked:
             row = what.row
             hidden = "-".join(map(str, what.hidden))
@@ -141,7 +146,8 @@ class Survey(Measurement):
                     part = rows[i : i + CHUNK]
                     episodes = f"{part[0].episode}-{part[-1].episode}"
                     jobs.append(Job(f"openings.{suite}.{task.name}.{episodes}", part))
-            jobs += self._compared(suite)
+            if suite in own:
+                jobs += self._compared(suite)
         return [*jobs, Job("speed", None)]
 
     def _compared(self, suite: str) -> list[Job]:
@@ -272,7 +278,8 @@ def measures(tables: "dict[str, pd.DataFrame]") -> "pd.DataFrame":
         ("look-alikes: track IoU", None, lookalikes, _mean_of("mean_iou")),
         (f"identity kept, {HIDDEN} frames behind an arm", None, arm, _share_of("kept")),
     ]
-    suite_names = [name for name in suites.BENCHMARKS if (views.suite == name).any()]
+    listed = (*suites.BENCHMARKS, *suites.ELSEWHERE)
+    suite_names = [name for name in listed if (views.suite == name).any()]
     lines = []
     for measure, target, table, statistic in rows:
         cells = {name: NONE for name in [*suite_names, ALL]}
@@ -412,7 +419,8 @@ def _by_k(choices: "pd.DataFrame") -> "pd.DataFrame":
     found["right"] = [each.text() for each in found["right"]]
     wide = found.pivot(index=["k", "rule"], columns="suite", values="right")
     wide = wide.reindex([(k, rule) for k in KS for rule in RULES])
-    wide = wide[[name for name in (*suites.BENCHMARKS, ALL) if name in wide]]
+    listed = (*suites.BENCHMARKS, *suites.ELSEWHERE, ALL)
+    wide = wide[[name for name in listed if name in wide]]
     wide.insert(0, "right instance, %", [f"K = {k}, {rule}" for k, rule in wide.index])
     return wide
 

@@ -214,8 +214,10 @@ def lookalikes(kind: str) -> tuple[ObjectModel, ...]:
 def tier(lookalike: ObjectModel) -> Tier:
     """How close a look-alike's colours are to its personal instance's.
 
-    hard: base and ink are both shared; medium: one of them; easy: neither.
+    hard: base and ink are both shared; medium: one of them; easy: neither, and other libraries'.
     """
+    if lookalike.split == "foreign":
+        return "easy"
     stem, _, _ = lookalike.name.partition("-lookalike-")
     ours, personal = lookalike.texture, OBJECTS[f"{stem}-personal"].texture
     assert isinstance(ours, Texture)
