@@ -74,7 +74,7 @@ def scripted(detector: Detector, scene: AnyScene, suite: Suite) -> Scripted:
     """
     (camera,) = open_env(scene, suite.cameras[:1]).cameras()
     if not isinstance(scene, Scene):
-        return PlacedScripted(scene.robot, suite.hz, camera, scene.sizes_m, detector)
+        return PlacedScripted(scene.robot, suite.hz, camera, scene.sizes_m)
     return Scripted(
         detector=detector,
         camera=camera,

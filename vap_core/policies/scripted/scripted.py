@@ -4,11 +4,13 @@ import copy
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.spatial.transform import Rotation
 
 from vap_core.base.errors import one_of
 from vap_core.base.types import Boxes, Camera, Colour, Rgb, value
@@ -227,7 +229,6 @@ class MonocularLocalizer:
 
     def _base_from_camera(self) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
         """Rotation from camera to robot base axes, and the camera's position in the base frame."""
-        from scipy.spatial.transform import Rotation
 
         base = np.eye(4)
         base[:3, :3] = Rotation.from_quat(self.base_world[3:], scalar_first=True).as_matrix()
@@ -246,7 +247,6 @@ class TruePlaces:
     places: Mapping[str, Pose]
     sizes_m: Mapping[str, tuple[float, float, float]]
     camera: Camera
-    detector: Detector | None = None
     target: str = ""
     table_z = 0.0
 
@@ -254,21 +254,15 @@ class TruePlaces:
         """As MonocularLocalizer.choose."""
         if self.target:
             return self.place(self.target)
-        assert self.detector is not None
-        boxes = self.detector([rgb], command.category)[0]
         alike = self._of_kind(command.category)
-        if not len(boxes) or not alike:
+        if not alike:
             return None
-        best = box_of_colour(rgb, boxes, command.colour)
+        boxes = np.array([self._box(name) for name in alike], np.float32)
+        shown = Boxes(boxes, np.ones(len(boxes), np.float32), command.category)
+        best = box_of_colour(rgb, shown, command.colour)
         if best is None and before is not None:
             return self.place(self.nearest(command.category, before[:2]))
-        if best is None:
-            best = int(draw * len(boxes.xyxy[boxes.score >= CONFIDENT * boxes.score[0]]))
-        middles = np.array([self.places[name][:3] for name in alike])
-        middles[:, 2] += [self.sizes_m[name][2] / 2 for name in alike]
-        box = boxes.xyxy[best].reshape(2, 2).mean(axis=0)
-        gaps = np.linalg.norm(optics.project(self.camera, middles) - box, axis=1)
-        return self.place(alike[int(gaps.argmin())])
+        return self.place(alike[int(draw * len(alike)) if best is None else best])
 
     def find(
         self, rgb: Rgb | None, category: str, colour: Colour | None = None, side: str = ""
@@ -284,6 +278,14 @@ class TruePlaces:
     def nearest(self, category: str, xy: Float64[np.ndarray, "2"]) -> str:
         gaps = {name: np.hypot(*(self.places[name][:2] - xy)) for name in self._of_kind(category)}
         return min(gaps, key=lambda name: gaps[name])
+
+    def _box(self, name: str) -> Float64[np.ndarray, "4"]:
+        """Around the picture of an object's bounding box."""
+        x, y, z = self.sizes_m[name]
+        corners = np.array([*product((-x / 2, x / 2), (-y / 2, y / 2), (0.0, z))])
+        turn = Rotation.from_quat(self.places[name][[4, 5, 6, 3]])
+        pixels = optics.project(self.camera, turn.apply(corners) + self.places[name][:3])
+        return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
 
     def place(self, name: str) -> Place:
         x, y = self.places[name][:2]
@@ -585,12 +587,11 @@ class PlacedScripted(Scripted):
         hz: float,
         camera: Camera,
         sizes_m: Mapping[str, tuple[float, float, float]],
-        detector: Detector | None = None,
     ) -> None:
         self.robot, self.motion, self.hz = robot, MOTIONS[robot.name], hz
         self.control = "ee"
         self.execute = max(1, round(self.replan_s * hz))
-        self.localizer = TruePlaces({}, sizes_m, camera, detector)
+        self.localizer = TruePlaces({}, sizes_m, camera)
 
     def _plan_episode(
         self, state: ScriptedState, policy_input: PolicyInput
