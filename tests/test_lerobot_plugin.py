@@ -183,8 +183,13 @@ def test_lerobots_own_command_gives_the_successes_of_our_engine(
     method: str,
     first: int,
     record_property: Callable[[str, object], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The shipped checkpoint as it is, and with VAP attached by our command; every row of a task."""
+    """The shipped checkpoint as it is, and with VAP attached by our command; every row of a task.
+
+    lerobot's loop has the policy's pictures alone, so that ours looks no closer either.
+    """
+    monkeypatch.setattr("vap_core.rollout.prompters.GROUNDING_PX", 224)
     study = Study(((SUITE, TASK),), (method,), policy="mini-pi0", follow="step")
     assert len(suites.rows(SUITE, TASK)) == 24
     rows = study.rows(SUITE, TASK)[first : first + EPISODES]
