@@ -661,6 +661,39 @@ def test_a_lerobot_checkpoint_of_liberos_shapes_behind_openpis_wire(tmp_path: Pa
     assert 0 < np.abs(moved[:, :3]).max() < 0.05
 
 
+def test_a_served_policy_keeps_the_contract() -> None:
+    """That of every policy, for one behind openpi's wire."""
+    from tests.contract import kept
+    from vap_core.contracts import test_policy
+    from vap_core.contracts.given import short_rows, trial_of
+    from vap_core.simulation import suites
+
+    where = "widowx-pick/pick-straw-cup"
+    suite = suites.suite("widowx-pick")
+    scene = trial_of(Reaching(), short_rows(where, 2)).scene
+    with ours(PolicyServer(Reaching(), MAPS["ours"], suite.cameras)) as port:
+        asked = served.served_for_suite(f"ws://127.0.0.1:{port}", scene, suite)
+        kept(test_policy, policy=asked, where=where)
+    scene.close()
+
+
+class Reaching:
+    """Moves by what it sees and where its hand is."""
+
+    label, execute = "reaching", 2
+
+    def start(self, rng: np.random.Generator) -> None:
+        return None
+
+    def plan(self, states: Any, inputs: Any) -> Any:
+        chunks = []
+        for each in inputs:
+            seen = sum(float(rgb.mean()) for rgb in each.images.values()) / 255
+            row = np.float32([0.01 * seen, 0.02 * each.state[1], -0.01, 0, 0, 0, 1])
+            chunks.append(np.stack([row, row / 2]))
+        return list(states), chunks
+
+
 @pytest.mark.timeout(240)
 def test_the_real_commands_give_what_the_policy_gives_in_process(tmp_path: Path) -> None:
     """eval through the proxy, generic, equals vap in process: episodes, outcomes, steps."""
