@@ -487,6 +487,7 @@ def policy_at(port: int) -> served.Served:
     policy = object.__new__(served.Served)
     policy.address = parse_address(f"ws://127.0.0.1:{port}")
     policy._names, policy._down = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper"), DOWN
+    policy._origin_m = (0.0, 0.0, 0.0)
     return policy
 
 

@@ -224,6 +224,22 @@ def test_a_policy_gets_back_what_a_map_sends() -> None:
             assert_array_equal(again.images[camera], rgb)
 
 
+def test_a_position_in_the_environments_own_frame() -> None:
+    request = MAPS["libero"].request(GIVEN, DOWN, (-0.5, 0.0, 0.4))
+    assert_allclose(request["observation/state"][:3], [0.0, 0.1, 0.7], atol=1e-6)
+
+
+def test_the_axis_of_a_turn_has_a_positive_x_as_in_liberos_data() -> None:
+    for tilt in (-0.05, 0.05):
+        state = STATE.copy()
+        state[3:6] = [tilt, 0, 0]
+        request = MAPS["libero"].request(PolicyInput(GIVEN.images, "", state), DOWN)
+        turn = request["observation/state"][3:6].astype(np.float64)
+        assert_allclose(turn, [np.pi + tilt, 0, 0], atol=1e-5)
+        wanted = Rotation.from_rotvec([tilt, 0, 0]).as_matrix() @ DOWN
+        assert_allclose(Rotation.from_rotvec(turn).as_matrix(), wanted, atol=1e-5)
+
+
 def test_joint_targets_become_steps_from_where_the_arm_is() -> None:
     convention = replace_map(actions=("joints", "closing"))
     first = STATE[7:] + 0.1

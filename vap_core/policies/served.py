@@ -216,6 +216,7 @@ class Served:
         self.execute = 1 if address.wire.by_step else address.map.execute
         self._names = open_env(scene, suite.cameras, control=suite.control).action_names
         self._down = scene.robot.down_base
+        self._origin_m = getattr(scene, "origin_m", (0.0, 0.0, 0.0))
         connection = Connection(address)
         connection.close()
         address.map.check(suite.cameras, self._names, connection.metadata)
@@ -234,7 +235,7 @@ class Served:
             for camera in asked.by_camera(list(given.images)):
                 report_input(i, camera, given.images[camera])
             report_input(i, TEXT, given.text)
-            session.connection.ask(asked.request(given, self._down))
+            session.connection.ask(asked.request(given, self._down, self._origin_m))
         chunks = []
         for session, given in zip(states, inputs, strict=True):
             reply = at(session.connection.answer(), asked.reply)

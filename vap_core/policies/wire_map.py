@@ -28,7 +28,9 @@ from vap_core.simulation.types import EE_ACTION
 STATE_PARTS: dict[str, int | None] = {
     "all": None,
     "position": 3,
+    "world-position": 3,
     "axis-angle": 3,
+    "axis-angle-positive-x": 3,
     "euler-xyz": 3,
     "quaternion-xyzw": 4,
     "quaternion-wxyz": 4,
@@ -38,8 +40,10 @@ STATE_PARTS: dict[str, int | None] = {
     "joints": None,
 }
 """Numbers of every part of a state. `all` is our own state (simulation.types.Observation); turns
-are the gripper's in the robot's base frame; `opening` is 0 closed to 1 open, `closing` the
-reverse, and `fingers` the travel of two, one of them negative."""
+and the position are the gripper's in the robot's base frame, `world-position` in the environment's
+own. Of the two axes of one turn, LIBERO's data has the one with a positive x, whose angle may
+exceed pi. `opening` is 0 closed to 1 open, `closing` the reverse, and `fingers` the travel of two, one of
+them negative."""
 ACTION_PARTS: dict[str, int | None] = {
     "all": None,
     "delta-position": 3,
@@ -148,13 +152,19 @@ class WireMap(Strict):
             found[there[0]] = picture.key, picture
         return found
 
-    def request(self, given: PolicyInput, down: np.ndarray) -> dict[Any, Any]:
-        """What is sent for an observation; `down` (3 x 3) turns a gripper to point down."""
+    def request(
+        self,
+        given: PolicyInput,
+        down: np.ndarray,
+        origin_m: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+    ) -> dict[Any, Any]:
+        """What is sent for an observation; `down` (3 x 3) turns a gripper to point down, `origin_m`
+        is where the environment's own frame has the origin of the state's."""
         sent: dict[Any, Any] = put({}, self.text, given.text)
         for name, (path, picture) in self.by_camera(list(given.images)).items():
             sent = put(sent, path, _formed(given.images[name], picture))
         for numbers in self.state:
-            parts = [_state_part(part, given.state, down) for part in numbers.parts]
+            parts = [_state_part(part, given.state, down, origin_m) for part in numbers.parts]
             sent = put(sent, numbers.key, np.concatenate(parts).astype(np.float32))
         return sent
 
@@ -269,14 +279,18 @@ def _widths(parts: Sequence[str], total: int) -> list[int]:
     return [rest if width is None else width for width in known]
 
 
-def _state_part(part: str, state: np.ndarray, down: np.ndarray) -> np.ndarray:
+def _state_part(
+    part: str, state: np.ndarray, down: np.ndarray, origin_m: np.ndarray | tuple[float, ...]
+) -> np.ndarray:
     name, factor = _named(part)
     opening = float(state[6])
     turn = Rotation.from_matrix(Rotation.from_rotvec(state[3:6]).as_matrix() @ down)
     parts = {
         "all": lambda: state,
         "position": lambda: state[:3],
+        "world-position": lambda: state[:3] + origin_m,
         "axis-angle": turn.as_rotvec,
+        "axis-angle-positive-x": lambda: _positive_x(turn.as_quat()),
         "euler-xyz": lambda: turn.as_euler("xyz"),
         "quaternion-xyzw": turn.as_quat,
         "quaternion-wxyz": lambda: turn.as_quat(scalar_first=True),
@@ -286,6 +300,12 @@ def _state_part(part: str, state: np.ndarray, down: np.ndarray) -> np.ndarray:
         "joints": lambda: state[7:],
     }
     return np.asarray(parts[name](), np.float64) * factor
+
+
+def _positive_x(quaternion: np.ndarray) -> np.ndarray:
+    x, y, z, w = quaternion if quaternion[0] >= 0 else -quaternion
+    angle = 2 * np.arccos(np.clip(w, -1.0, 1.0))
+    return np.array([x, y, z]) * angle / max(float(np.sqrt(1 - min(w * w, 1.0))), 1e-9)
 
 
 def _enter(ours: np.ndarray, name: str, numbers: np.ndarray, joints: np.ndarray) -> None:
@@ -371,10 +391,17 @@ MAPS: dict[str, WireMap] = {
         about="openpi's LIBERO policies: OSC_POSE of a Panda at 20 Hz",
         pictures=(
             Picture(key=("observation/image",), size=224),
-            Picture(key=("observation/wrist_image",), camera=("wrist", "image2"), size=224),
+            Picture(
+                key=("observation/wrist_image",),
+                camera=("wrist", "robot0_eye_in_hand", "image2"),
+                size=224,
+            ),
         ),
         state=(
-            Numbers(key=("observation/state",), parts=("position", "axis-angle", "fingers*0.04")),
+            Numbers(
+                key=("observation/state",),
+                parts=("world-position", "axis-angle-positive-x", "fingers*0.04"),
+            ),
         ),
         actions=("delta-position*0.05", "delta-axis-angle*0.5", "closing-sign"),
         execute=5,
