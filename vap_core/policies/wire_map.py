@@ -42,8 +42,8 @@ STATE_PARTS: dict[str, int | None] = {
 """Numbers of every part of a state. `all` is our own state (simulation.types.Observation); turns
 and the position are the gripper's in the robot's base frame, `world-position` in the environment's
 own. Of the two axes of one turn, LIBERO's data has the one with a positive x, whose angle may
-exceed pi. `opening` is 0 closed to 1 open, `closing` the reverse, and `fingers` the travel of two, one of
-them negative."""
+exceed pi. `opening` is 0 closed to 1 open, `closing` the reverse, and `fingers` the travel of two,
+one of them negative."""
 ACTION_PARTS: dict[str, int | None] = {
     "all": None,
     "delta-position": 3,
