@@ -243,6 +243,6 @@ def test_a_dead_worker_is_said_and_what_was_done_stays(tmp_path: Path) -> None:
 def test_study_refuses_unknown_names() -> None:
     with pytest.raises(
         UnknownName,
-        match="known: franka-pick, shared-pair, shared-sequence, shared-sequence-bridge, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick",
+        match="known: franka-pick, libero-personal, libero-personal-dev, shared-pair, shared-sequence, shared-sequence-bridge, simpler-bridge, simpler-fractal, tabletop, vlabench, widowx-pick",
     ):
         Study((("nowhere", "pick-cup"),), ("vap",))

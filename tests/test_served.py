@@ -704,6 +704,7 @@ def test_the_real_commands_give_what_the_policy_gives_in_process(tmp_path: Path)
     def server(*words: str) -> str:
         command = [sys.executable, "-m", "vap_core", "serve", *words, "--port", "0"]
         process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        stack.callback(process.communicate, timeout=30)  # what it prints at its end
         stack.callback(process.terminate)
         assert process.stdout is not None
         told = next(line for line in process.stdout if "serving" in line)

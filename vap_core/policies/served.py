@@ -214,7 +214,7 @@ class Served:
         self.address = address
         self.label = address.label
         self.execute = 1 if address.wire.by_step else address.map.execute
-        self._names = open_env(scene, suite.cameras, control=suite.control).action_names
+        self._names = open_env(scene, scene.cameras, control=suite.control).action_names
         self._down = scene.robot.down_base
         self._origin_m = getattr(scene, "origin_m", (0.0, 0.0, 0.0))
         connection = Connection(address)

@@ -345,7 +345,7 @@ def load_for_suite(
     if key not in _loaded:
         _loaded[key] = (now, load_policy(checkpoint, temperature=temperature))
     policy = _loaded[key][1]
-    env = open_env(scene, suite.cameras, control=suite.control)
+    env = open_env(scene, scene.cameras, control=suite.control)
     policy.check(suite.cameras, len(env.state()), len(env.action_names))
     return policy
 
