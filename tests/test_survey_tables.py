@@ -176,7 +176,8 @@ def test_the_plan_is_the_same_every_time_and_every_part_has_its_own_name() -> No
 
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(
-        UnknownName, match="known: libero-personal, libero-personal-dev, simpler-bridge, simpler-fractal, tabletop, vlabench"
+        UnknownName,
+        match="known: libero-personal, libero-personal-dev, simpler-bridge, simpler-fractal, tabletop, vlabench",
     ):
         Survey(suites=("widowx-pick",))
     with pytest.raises(UnknownName, match="embedded"):
