@@ -579,6 +579,18 @@ def test_names_and_texts_from_outside_reach_no_terminal_and_stop_no_recording(
     assert "\x1b" not in "".join(store.read(tmp_path / "run")["instruction"])
 
 
+def test_actions_that_cannot_be_recorded_reach_the_client(tmp_path: Path) -> None:
+    about = {"method": "vap", "policy": "ws://127.0.0.1:1", "wire": "openpi"}
+    empty = pack({"actions": np.zeros((0, 7))}, str.encode)
+    with stand_in(answering(empty, empty, empty)) as behind:
+        records = Records(tmp_path / "run", MEMORY, about)
+        proxy = Proxy(f"ws://127.0.0.1:{behind}", attender(), Options(), records)
+        with ours(proxy) as port, connect(f"ws://127.0.0.1:{port}") as socket:
+            socket.recv(5)
+            for x in (24, 25, 26):
+                assert ask(socket, observation(line(x))) == empty
+
+
 def test_a_thousand_faults_tint_no_wrong_episode_and_pass_nothing_in_silence() -> None:
     """Whatever a client sends, the server behind gets what the method itself gives, or nothing."""
     rng, models = np.random.default_rng(7), attender()

@@ -80,8 +80,11 @@ class Records(Keeper):
             call = len(episode.waited_ms) - 1
             if episode.recorder is not None and actions is not None and not self._failed:
                 at_s = episode.at_s[min(call, len(episode.at_s) - 1)]
-                row = actions.reshape(len(actions), -1)[0].astype(np.float64)
-                episode.recorder.add_numbers(call, at_s, {"/action": row}, ())
+                try:
+                    row = actions.reshape(len(actions), -1)[0].astype(np.float64)
+                    episode.recorder.add_numbers(call, at_s, {"/action": row}, ())
+                except Exception as error:
+                    self._give_up(error)
 
     def ended(self, stream: object) -> None:
         with self._lock:
