@@ -698,6 +698,8 @@ def bench(
     from vap_core.base.errors import one_of
 
     if what == "proxy":
+        import pandas as pd
+
         from vap_core.serve import latency
         from vap_core.study.table import printed
 
@@ -705,12 +707,8 @@ def bench(
         print(f"{machine['machine']}, {machine['commit']}")
         with tempfile.TemporaryDirectory() as scratch:
             for measured in (latency.alone, latency.between):
-                rows = measured(Path(scratch), quick)
-                cells = [
-                    [f"{v:.1f}" if isinstance(v, float) else str(v) for v in row.values()]
-                    for row in rows
-                ]
-                print("\n" + printed([list(rows[0]), *cells]))
+                table_of = pd.DataFrame(measured(Path(scratch), quick)).round(1)
+                print("\n" + printed(table_of))
         return
     if what not in BENCHES:
         raise one_of("bench:", what, [*BENCHES, "proxy"])

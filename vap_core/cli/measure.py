@@ -324,7 +324,7 @@ def eval_obedience(
     """Does a policy obey a tint? True, wrong and no masks on the same 30 to 150 episodes, stopped
     as soon as it is known; a page with one sentence and two recordings. Interrupted, it goes on.
 
-    Example: python -m vap_core measure obedience --policy ws://gpu:8000?map=bridge
+    Example: python -m vap_core measure obedience --policy "ws://gpu:8000?map=bridge"
         --suite simpler-bridge
     """
     from vap_core.base.errors import BadStudy

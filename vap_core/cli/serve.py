@@ -104,12 +104,11 @@ def serve(asked: AskedOfServe) -> None:
 
 def _policy_server(asked: AskedOfServe, wire: "Wire") -> "PolicyServer":
     from vap_core.policies.names import POLICIES
-    from vap_core.policies.wire_map import load_map
+    from vap_core.policies.wire_map import OURS, load_map
     from vap_core.serve.server import PolicyServer
 
     assert asked.policy is not None
-    usual = "ours-vla-eval" if wire.marks_episodes else "ours"
-    convention = load_map(asked.wire_map or usual)
+    convention = load_map(asked.wire_map or OURS[wire.name])
     if asked.suite:
         from vap_core.simulation import suites
         from vap_core.study.trials import Study, make_trial
@@ -150,7 +149,6 @@ def _proxy(asked: AskedOfServe, wire: "Wire", upstream: str) -> None:
         cameras=tuple(asked.camera or ()),
         new_episode=asked.new_episode,
         objects=None if asked.object is None else tuple(asked.object),
-        dry=asked.dry,
     )
     proxy = Proxy(url, attender, options, Records(asked.record, bank, about))
     objects = ", ".join(bank) or "nothing"

@@ -20,7 +20,7 @@ from vap_core.base.errors import BadEndpoint, BadMessage, BadPlan, BadPolicy, fi
 from vap_core.environments import AnyScene, open_env
 from vap_core.policies.names import is_served, policy_label
 from vap_core.policies.protocol import TEXT, Chunk, PolicyInput, report_input
-from vap_core.policies.wire_map import WireMap, load_map
+from vap_core.policies.wire_map import OURS, WireMap, load_map
 from vap_core.policies.wires import (
     LARGEST_MESSAGE,
     TOKEN,
@@ -71,8 +71,7 @@ def parse_address(name: str) -> Address:
         if option not in ("map", "wire"):
             raise one_of(f"policy {name}: option", option, ("map", "wire"))
     wire = options.get("wire", "")
-    default = "ours-vla-eval" if wire == "vla-eval" else "ours"
-    map_name = options.get("map", default)
+    map_name = options.get("map", OURS.get(wire, OURS["openpi"]))
     convention = load_map(map_name)
     url = parts._replace(query="", fragment="").geturl()
     return Address(url, wire_of(wire or convention.wire), convention, map_name)

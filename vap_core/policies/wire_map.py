@@ -427,15 +427,12 @@ MAPS: dict[str, WireMap] = {
         text=("task_description",),
         actions=("delta-position", "delta-axis-angle", "opening"),
     ),
-    "fractal": WireMap(
-        about="vla-eval's SIMPLER servers, Google robot at 3 Hz",
-        wire="vla-eval",
-        pictures=(Picture(key=("images", "primary")),),
-        state=(Numbers(key=("states",), parts=("position", "quaternion-wxyz", "opening")),),
-        text=("task_description",),
-        actions=("delta-position", "delta-axis-angle", "opening"),
-    ),
 }
+MAPS["fractal"] = MAPS["bridge"].model_copy(
+    update={"about": "vla-eval's SIMPLER servers, Google robot at 3 Hz"}
+)
+OURS = {"openpi": "ours", "vla-eval": "ours-vla-eval"}
+"""The map of our own policies behind each wire."""
 
 
 def load_map(name: str) -> WireMap:

@@ -24,15 +24,16 @@ from vap_core.attend import Attender
 from vap_core.base.types import Views
 from vap_core.memory import load_bank
 from vap_core.perception.stacks import load_stack
+from vap_core.policies.scripted.expert import Expert
 from vap_core.policies.wires import WIRES, node_of, pack
 from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import generic
-from vap_core.serve.proxy import Stream
+from vap_core.serve.proxy import Options, Stream
 from vap_core.serve.server import listen
 from vap_core.simulation import suites
 from vap_core.simulation.suites.open_row import build_scene, models_of
 from vap_core.study.measurement import Row
-from vap_core.study.trials import Expert, Study, register_personal
+from vap_core.study.trials import Study, register_personal
 
 SUITE, TASK = "vlabench", "select-cat-figurine"
 SIDE_PX, EVERY, EPISODES = 256, 2, 4
@@ -83,7 +84,7 @@ def alone(folder: Path, quick: bool) -> list[Row]:
     for cameras in CAMERAS:
         parts: list[dict[str, float]] = []
         for n, calls in enumerate([played[0], *played]):
-            stream = Stream(attender, partial(next, count()), new_episode="prompt")
+            stream = Stream(attender, partial(next, count()), Options(new_episode="prompt"))
             for views, state, text in calls:
                 began = time.process_time()
                 _, found = stream.prompt(payload(views, cameras, state, text))

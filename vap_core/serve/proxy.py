@@ -97,11 +97,24 @@ class Ongoing:
     before: tuple[Views, Attended] | None = None
 
 
+@dataclass(frozen=True)
+class Options:
+    """Which pictures are prompted (all), when an episode starts, which objects are meant."""
+
+    cameras: tuple[str, ...] = ()
+    new_episode: NewEpisode = "auto"
+    objects: tuple[str, ...] | None = None
+
+
+AS_USUAL = Options()
+
+
 class Stream:
     """Prompts the observations of one client, or of one session of a client that has several.
 
-    An episode starts with the stream, at a message that says so, and by `new_episode`: "auto" at
-    another command, and where the robot is back where it began, or every view changes, at once;
+    Without an attender nothing is prompted. An episode starts with the stream, at a message that
+    says so, and by `new_episode`: "auto" at another command, and where the robot is back where it
+    began, or every view changes, at once;
     "prompt" at another command; with "connection" another command is refused, and with "never" it
     is tracked on under the first one.
     """
@@ -110,16 +123,11 @@ class Stream:
         self,
         attender: Attender | None,
         number: Callable[[], int],
-        *,
-        cameras: tuple[str, ...] = (),
-        new_episode: NewEpisode = "auto",
-        objects: tuple[str, ...] | None = None,
+        options: Options = AS_USUAL,
     ) -> None:
         self._attender = attender
         self._number = number
-        self._cameras = cameras
-        self._new_episode = new_episode
-        self._objects = objects
+        self._options = options
         self._ongoing: Ongoing | None = None
         self._asked = "the first observation of the connection"
 
@@ -135,14 +143,15 @@ class Stream:
             `Attender.step`.
         """
         began = time.perf_counter()
-        pictures = find_pictures(payload, self._cameras)
+        pictures = find_pictures(payload, self._options.cameras)
         names = _camera_names(list(pictures))
         views = {names[path]: picture.rgb for path, picture in pictures.items()}
         text_path, text = find_text(payload)
         vector = state_vector(payload)
         read = time.perf_counter()
-        why = self._starts(text, vector, views)
-        if why and not vector.size and self._new_episode == "auto":
+        thumbnails = _thumbnails(views)
+        why = self._starts(text, vector, thumbnails)
+        if why and not vector.size and self._options.new_episode == "auto":
             why += NO_STATE
         episode = self._ongoing
         if why or episode is None:
@@ -156,7 +165,8 @@ class Stream:
         else:
             attended = _untouched(views, text)
         self._ongoing = episode
-        self._remember(episode, vector, views, attended)
+        episode.before = views, attended
+        _remember(episode, vector, thumbnails)
         prompted = time.perf_counter()
         if attended.text != text:
             payload = put(payload, text_path, attended.text)
@@ -174,13 +184,13 @@ class Stream:
         if self._attender is None:
             return None, _untouched(views, text)
         try:
-            return self._attender.start(views, text, objects=self._objects)
+            return self._attender.start(views, text, objects=self._options.objects)
         except NothingPersonal:
             return None, _untouched(views, text)
 
-    def _starts(self, text: str, vector: np.ndarray, views: Views) -> str:
+    def _starts(self, text: str, vector: np.ndarray, thumbnails: list[np.ndarray]) -> str:
         """Why an episode starts with this observation; "" where it goes on."""
-        episode, mode = self._ongoing, self._new_episode
+        episode, mode = self._ongoing, self._options.new_episode
         if episode is None:
             return self._asked
         if text != episode.text:
@@ -195,23 +205,22 @@ class Stream:
             return ""
         if put_back(episode, vector):
             return "the robot is back where the episode began, in one call"
-        change = _change(episode, views)
+        change = _change(episode, thumbnails)
         if episode.call > 2 and change > JUMP * episode.largest_change:
             return f"every view changes at once ({change:.0f} levels)"
         return ""
 
-    def _remember(
-        self, episode: Ongoing, vector: np.ndarray, views: Views, attended: Attended
-    ) -> None:
-        if episode.call:
-            episode.largest_change = max(episode.largest_change, _change(episode, views))
-            moved = np.abs(vector - episode.vectors[-1]) if _fits(episode, vector) else None
-            if moved is not None:
-                longest = episode.longest
-                episode.longest = moved if longest is None else np.maximum(longest, moved)
-        episode.vectors = [*episode.vectors[:1], vector]
-        episode.thumbnails = _thumbnails(views)
-        episode.before = views, attended
+
+def _remember(episode: Ongoing, vector: np.ndarray, thumbnails: list[np.ndarray]) -> None:
+    """Keep what `_starts` compares the next observation with."""
+    if episode.call:
+        episode.largest_change = max(episode.largest_change, _change(episode, thumbnails))
+        if _fits(episode, vector):
+            moved = np.abs(vector - episode.vectors[-1])
+            longest = episode.longest
+            episode.longest = moved if longest is None else np.maximum(longest, moved)
+    episode.vectors = [*episode.vectors[:1], vector]
+    episode.thumbnails = thumbnails
 
 
 @dataclass(frozen=True)
@@ -326,9 +335,9 @@ def _thumbnails(views: Views) -> list[np.ndarray]:
     return [picture.astype(np.int16) for picture in small]
 
 
-def _change(episode: Ongoing, views: Views) -> float:
+def _change(episode: Ongoing, thumbnails: list[np.ndarray]) -> float:
     """The mean change of levels since the last call, of the view that changes least."""
-    pairs = zip(_thumbnails(views), episode.thumbnails, strict=False)
+    pairs = zip(thumbnails, episode.thumbnails, strict=False)
     return min((float(np.abs(now - before).mean()) for now, before in pairs), default=0.0)
 
 
@@ -353,16 +362,6 @@ def _camera_names(paths: list[Path]) -> dict[Path, str]:
     return dict(zip(paths, last if unique else whole, strict=True))
 
 
-@dataclass(frozen=True)
-class Options:
-    """How a proxy prompts. `dry` prompts nothing."""
-
-    cameras: tuple[str, ...] = ()
-    new_episode: NewEpisode = "auto"
-    objects: tuple[str, ...] | None = None
-    dry: bool = False
-
-
 class Keeper:
     """What a proxy tells of its episodes; a subclass records them. Calls come from threads."""
 
@@ -381,7 +380,7 @@ class Proxy:
     ) -> None:
         self.upstream = upstream
         self.keeper = keeper
-        self._attender = None if options.dry else attender
+        self._attender = attender
         self._options = options
         self._episodes = 0
         self._threads = ThreadPoolExecutor(cores(), "attend")
@@ -434,14 +433,7 @@ class Proxy:
         raise AssertionError
 
     def stream(self) -> Stream:
-        options = self._options
-        return Stream(
-            self._attender,
-            self._number,
-            cameras=options.cameras,
-            new_episode=options.new_episode,
-            objects=options.objects,
-        )
+        return Stream(self._attender, self._number, self._options)
 
     async def run[T](self, work: Callable[..., T], *given: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, work, *given)

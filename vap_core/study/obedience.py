@@ -18,7 +18,7 @@ import numpy as np
 from vap_core.base.errors import BadStudy, command
 from vap_core.base.files import write_atomic, writing
 from vap_core.study.measurement import Measurement, Row, Tables, measure
-from vap_core.study.stats import compare, mcnemar, points_text, rate
+from vap_core.study.stats import Estimate, compare, mcnemar, points_text, rate
 from vap_core.study.table import printed
 from vap_core.study.trials import Study, make_trial, register_personal
 
@@ -149,14 +149,14 @@ def verdict(only_generic: int, only_tinted: int, n: int) -> Verdict:
     return "does not obey" if gain + half < LEAST else "open"
 
 
-def look(table: "pd.DataFrame") -> tuple[Verdict, int]:
-    """The verdict on the episodes so far, and their number."""
+def look(table: "pd.DataFrame") -> Verdict:
+    """The verdict on the episodes so far."""
     wide = table[table["method"].isin(["generic", "oracle-mask"])].pivot_table(
         index=["task", "episode"], columns="method", values="success", aggfunc="last"
     )
     plain, tinted = wide["generic"].astype(bool), wide["oracle-mask"].astype(bool)
     lost, won = int((plain & ~tinted).sum()), int((~plain & tinted).sum())
-    return verdict(lost, won, len(wide)), len(wide)
+    return verdict(lost, won, len(wide))
 
 
 def run(asked: Obedience, folder: Path, *, workers: int = 1) -> str:
@@ -173,11 +173,11 @@ def run(asked: Obedience, folder: Path, *, workers: int = 1) -> str:
                 f"measure obedience: every episode of an arm is an error; the last: "
                 f"{table[errors]['detail'].iloc[-1].strip().splitlines()[-1]}"
             )
-        found, _n = look(table)
+        found = look(table)
         if found != "open" or waves * WAVE >= n_rows:
             break
     sentence = in_words(table, found)
-    page = _page(table, sentence, asked, folder)
+    page = _page(table, sentence, folder)
     with writing(folder, "measure obedience"):
         write_atomic(folder / "obedience.html", page.encode())
     return f"{sentence}\n\n{printed(arms(table))}\n\nwrote {folder / 'obedience.html'}"
@@ -192,12 +192,11 @@ def arms(table: "pd.DataFrame") -> "pd.DataFrame":
         part = table[table["method"] == method]
         line: Row = {"arm": method, "shows": shown, "n": len(part)}
         line["errors"] = int(part["outcome"].eq("error").sum())
-        line["success"] = str(rate(int(part["success"].sum()), len(part)))
-        line["wrong object"] = str(rate(int(part["wrong_object"].sum()), len(part)))
+        line["success"] = str(_rate(table, method, "success"))
+        line["wrong object"] = str(_rate(table, method, "wrong_object"))
         line["against generic, points"] = line["p"] = "-"
         if method != "generic":
-            pair = table[table["method"].isin(["generic", method])]
-            found = compare(pair, ["generic", method], by_task=False).iloc[0]
+            found = _against_generic(table, method)
             line["against generic, points"] = points_text(found)
             line["p"] = f"{found.p:.2g}"
         lines.append(line)
@@ -206,14 +205,9 @@ def arms(table: "pd.DataFrame") -> "pd.DataFrame":
 
 def in_words(table: "pd.DataFrame", found: Verdict) -> str:
     """The answer in one sentence."""
-    rates = {}
-    for method in ("generic", "oracle-mask"):
-        part = table[table["method"] == method]
-        rates[method] = rate(int(part["success"].sum()), len(part))
-    wrong = table[table["method"] == "wrong-mask"]
-    moved = rate(int(wrong["wrong_object"].sum()), len(wrong))
-    pair = table[table["method"].isin(["generic", "oracle-mask"])]
-    gain = points_text(compare(pair, ["generic", "oracle-mask"], by_task=False).iloc[0])
+    plain, tinted = (_rate(table, method, "success") for method in ("generic", "oracle-mask"))
+    moved = _rate(table, "wrong-mask", "wrong_object")
+    gain = points_text(_against_generic(table, "oracle-mask"))
     policy, suite = table["policy"].iloc[0], table["suite"].iloc[0]
     said = {
         "obeys": "obeys a tint",
@@ -221,13 +215,22 @@ def in_words(table: "pd.DataFrame", found: Verdict) -> str:
         "open": "may obey a tint, which so many episodes do not decide",
     }[found]
     return (
-        f"{policy} {said} on {suite}: success {rates['generic']} without, {rates['oracle-mask']} "
-        f"with the true mask ({gain} points, n {rates['generic'].n}, 95 %); with a look-alike's "
-        f"mask it moves a wrong object in {moved}."
+        f"{policy} {said} on {suite}: success {plain} without, {tinted} with the true mask ({gain} "
+        f"points, n {plain.n}, 95 %); with a look-alike's mask it moves a wrong object in {moved}."
     )
 
 
-def _page(table: "pd.DataFrame", sentence: str, asked: Obedience, folder: Path) -> str:
+def _rate(table: "pd.DataFrame", method: str, measure: str) -> Estimate:
+    part = table[table["method"] == method]
+    return rate(int(part[measure].sum()), len(part))
+
+
+def _against_generic(table: "pd.DataFrame", method: str) -> "pd.Series":
+    pair = table[table["method"].isin(["generic", method])]
+    return compare(pair, ["generic", method], by_task=False).iloc[0]
+
+
+def _page(table: "pd.DataFrame", sentence: str, folder: Path) -> str:
     from vap_core.study.report import STYLE
 
     recordings = sorted((folder / "recordings").glob("*.rrd"))
