@@ -1,4 +1,4 @@
-"""Commands as `python -m vap_core` runs them: in this process, or in one of their own."""
+"""Commands as `./vap` runs them: in this process, or in one of their own."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ class Done:
 
 
 def vap(*words: str | Path, env: Mapping[str, str] | None = None) -> Done:
-    """Run `python -m vap_core WORDS` in this process."""
+    """Run `./vap WORDS` in this process."""
     out, err = StringIO(), StringIO()
     with (
         pytest.MonkeyPatch.context() as patch,
@@ -58,7 +58,7 @@ def refused(*words: str | Path) -> str:
 
 
 def process(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run `python -m vap_core WORDS` in a process of its own, which logs its readings in `cwd`."""
+    """Run `./vap WORDS` in a process of its own, which logs its readings in `cwd`."""
     return subprocess.run(
         [sys.executable, "-m", "vap_core", *map(str, words)],
         cwd=cwd,

@@ -41,7 +41,7 @@ def commands(page: str) -> list[str]:
         lines += block.splitlines()
     found = []
     for line in lines:
-        said = re.search(r"python -m vap_core\b(.*)", line)
+        said = re.search(r"\./vap (.*)", line)
         if said is not None:
             found.append(re.split(r"\s#\s", said[1])[0].strip())
     return found

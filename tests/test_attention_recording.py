@@ -155,7 +155,7 @@ def test_the_command_names_the_step_of_a_words_highest_peak(recorded: tuple[Path
         "--frame",
         str(highest),
     ]
-    assert shlex.split(line) == ["next:", "python", "-m", "vap_core", *picture]
+    assert shlex.split(line) == ["next:", "./vap", *picture]
 
 
 @pytest.mark.slow

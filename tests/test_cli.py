@@ -91,7 +91,7 @@ def test_help_has_examples_to_copy_a_line_each(words: tuple[str, ...]) -> None:
     assert done.exit_code == 0
     assert lines
     assert done.stdout.count("Example:") == len(lines)
-    assert all(line.startswith(f"Example: python -m vap_core {' '.join(words)}") for line in lines)
+    assert all(line.startswith(f"Example: ./vap {' '.join(words)}") for line in lines)
 
 
 def test_help() -> None:

@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -29,10 +30,10 @@ def next_words(said: str) -> list[str]:
 
 def test_every_word_and_variable_is_read_back() -> None:
     line = command("view", Path(ODD), "it's", environment={"VAP_SUITES": f"{ODD}/desk.py"})
-    words = [f"VAP_SUITES={ODD}/desk.py", "python", "-m", "vap_core", "view", ODD, "it's"]
+    words = [f"VAP_SUITES={ODD}/desk.py", "./vap", "view", ODD, "it's"]
     assert shlex.split(line) == words
     assert line.startswith("VAP_SUITES='"), "a quoted name would not be a variable"
-    assert command("eval", "--episodes", "4") == "python -m vap_core eval --episodes 4"
+    assert command("eval", "--episodes", "4") == "./vap eval --episodes 4"
 
 
 def test_the_command_after_photographs_is_read_back(tmp_path: Path) -> None:
@@ -40,7 +41,7 @@ def test_the_command_after_photographs_is_read_back(tmp_path: Path) -> None:
     done = vap("objects", "photograph", "cup-personal", "--out", out, "--views", "2")
     photos = [str(path) for path in sorted(out.glob("*.png"))]
     assert next_words(done.stdout) == [
-        *("python", "-m", "vap_core", "register"),
+        *("./vap", "register"),
         *("cup-personal", "--category", "cup", *photos),
     ]
 
@@ -51,7 +52,7 @@ def test_the_command_after_an_import_is_read_back(tmp_path: Path) -> None:
     done = vap("objects", "import", file, *words)
     assert next_words(done.stdout) == [
         f"VAP_OBJECTS={tmp_path / ODD}",
-        *("python", "-m", "vap_core", "eval", "--suite", "SUITE"),
+        *("./vap", "eval", "--suite", "SUITE"),
         *("--object", "mug", "--out", "data/runs/mug"),
     ]
 
@@ -59,7 +60,7 @@ def test_the_command_after_an_import_is_read_back(tmp_path: Path) -> None:
 def test_no_command_is_printed_with_a_value_that_is_not_quoted() -> None:
     """`command` writes them; a line of a module's own making left its values unquoted."""
     for path in sorted(Path(cli.__file__).parent.rglob("*.py")):
-        found = re.findall(r"""f["'].*python -m vap_core [^"]*\{.*""", path.read_text())
+        found = re.findall(r"""f["'].*\./vap [^"]*\{.*""", path.read_text())
         assert not found, path.name
 
 
@@ -71,7 +72,7 @@ def test_another_python_is_told_the_set_up_in_one_line(words: tuple[str, ...]) -
     assert done.returncode == 1
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith("error: vap_core's packages are not installed for ")
-    assert line.endswith("-m vap_core")
+    assert line.endswith("./vap")
     found = {row.split()[1]: row for row in done.stdout.splitlines()}
     assert set(found) == (
         {"python", "environment", "packages", "pictures", "display"}
@@ -124,3 +125,19 @@ def test_numbers_and_articles_agree_with_their_noun() -> None:
         "an Owl",
         "a cup",
     ]
+
+
+def test_the_launcher_runs_from_anywhere_and_says_what_is_absent(tmp_path: Path) -> None:
+    """It names the environment of its own folder, also through a link."""
+    (tmp_path / "linked").symlink_to(ROOT / "vap")
+    done = subprocess.run(
+        [tmp_path / "linked", "ablate", "--help"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("Usage: ./vap ablate")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    copied = shutil.copy(ROOT / "vap", bare)
+    done = subprocess.run([copied], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == f"error: there is no environment in {bare} yet; run: make setup\n"

@@ -336,7 +336,7 @@ def put(path: Path, **new: object) -> None:
     [
         (
             shutil.rmtree,
-            "holds no demonstrations; make them with: python -m vap_core train demonstrations",
+            "holds no demonstrations; make them with: ./vap train demonstrations",
         ),
         (lambda f: cut(f / "data/chunk-000/file-000.parquet"), "is damaged .ArrowInvalid"),
         (lambda f: cut(f / "meta/episodes/chunk-000/file-000.parquet"), "is damaged .ArrowInvalid"),

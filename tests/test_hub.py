@@ -400,5 +400,5 @@ def test_commands_pull_and_list(tmp_path: Path) -> None:
         in listed.stdout
     )
     assert "facebook/sam2.1-hiera-tiny@de431c40: here" in listed.stdout
-    assert "foundation: run `python -m vap_core weights pull --stack foundation`" in listed.stdout
+    assert "foundation: run `./vap weights pull --stack foundation`" in listed.stdout
     assert "foundation-small: run" not in listed.stdout

@@ -38,7 +38,7 @@ def shelf(tmp_path_factory):
         with Image.open(folder / "objects" / "my-mug.preview.png") as preview:
             assert preview.size == (1280, 320)
         assert "my-mug: a cup, 7.0 x 7.0 x 9.0 cm" in done.stdout
-        assert "next: python -m vap_core eval --suite SUITE --object my-mug " in done.stdout
+        assert "next: ./vap eval --suite SUITE --object my-mug " in done.stdout
         yield folder
 
 

@@ -72,7 +72,7 @@ def test_where_every_object_is_left_out_the_remedy_is_one_that_there_is(tmp_path
     assert "measure objects: every object was left out. open: " in line
     assert "is not watertight" in line
     assert "report.txt in out says why of 1 more." in line
-    command, _, then = line.partition("python -m vap_core ")[2].partition("; ")
+    command, _, then = line.partition("./vap ")[2].partition("; ")
     assert shlex.split(command) == [
         "objects", "import", str(folder / "open.ply"), "--category", "coffee cup",
         "--height-cm", "6", "--repair", "--out", "DIR",

@@ -123,7 +123,7 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
     setting, *rest = shlex.split(command)
     assert (setting, rest) == (
         f"VAP_SUITES={file}",
-        ["python", "-m", "vap_core", "report", str(out)],
+        ["./vap", "report", str(out)],
     )
     told = run_as_told(command, tmp_path)
     assert told.returncode == 0, told.stderr
@@ -132,7 +132,7 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
     assert without.stderr.endswith(f"An own suite is found by its file: {command}\n")
     monkeypatch.setenv("VAP_SUITES", str(file))
     (line,) = provenance(load_runs([out])).command
-    assert line.startswith(f"VAP_SUITES={shlex.quote(str(file))} python -m vap_core eval --suite ")
+    assert line.startswith(f"VAP_SUITES={shlex.quote(str(file))} ./vap eval --suite ")
     again = run_as_told(f"{line} --record none --workers 1 --out again", tmp_path)
     assert again.returncode == 0, again.stderr
     assert read_manifest(tmp_path / "again")["digest"] == read_manifest(out)["digest"]
@@ -162,12 +162,12 @@ def test_the_reports_command_finds_the_suite(file: Path) -> None:
     }
     assert shlex.split(command_line(study))[:6] == [
         f"VAP_SUITES={file}",
-        *("python", "-m", "vap_core", "eval", "--suite"),
+        *("./vap", "eval", "--suite"),
     ]
     several = {**study, "tasks": [*study["tasks"], ["simpler-bridge", "pick-shaver"]]}
     assert f"suite_files=({str(file)!r},)" in command_line(several), "told in code"
     other = {**study, "tasks": [["simpler-bridge", "pick-shaver"]], "episodes": 2}
-    assert command_line(other).startswith("python -m vap_core rollout")
+    assert command_line(other).startswith("./vap rollout")
 
 
 @pytest.mark.parametrize("name", ["simpler-bridge", "my-absent"])

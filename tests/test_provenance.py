@@ -17,12 +17,11 @@ def test_the_command_of_a_run_is_told() -> None:
         "seed": 2,
     }
     told = (
-        "python -m vap_core eval --suite simpler-bridge --method generic --method vap --seed 2 "
-        "--policy scripted"
+        "./vap eval --suite simpler-bridge --method generic --method vap --seed 2 --policy scripted"
     )
     assert command_line(study) == told
     part = (
-        "python -m vap_core rollout --suite simpler-bridge --task pick-shaver --method vap "
+        "./vap rollout --suite simpler-bridge --task pick-shaver --method vap "
         "--episodes 3 --seed 2 --policy scripted"
     )
     assert command_line({**study, "tasks": whole[:1], "methods": ["vap"], "episodes": 3}) == part
@@ -39,7 +38,7 @@ def test_the_command_of_a_run_is_told() -> None:
     demo = [["widowx-pick", "pick-straw-cup"], ["franka-pick", "pick-cup"]]
     assert (
         command_line({**study, "tasks": demo, "episodes": 20})
-        == "python -m vap_core demo --episodes 20 --seed 2"
+        == "./vap demo --episodes 20 --seed 2"
     )
     for other in ({"methods": ["vap"]}, {"policy": "expert"}, {"seeds": 2}, {"episodes": None}):
         told = command_line({**study, "tasks": demo, "episodes": 20, **other})
@@ -51,13 +50,13 @@ def test_a_whole_list_of_one_task_is_told_in_code_and_an_own_object_by_eval() ->
     study = {"methods": ["vap"], "policy": "scripted", "seed": 0, "episodes": None}
     part = {**study, "tasks": [["vlabench", "select-cup"]]}
     assert command_line(part).startswith("Study("), "rollout plays 20 by itself"
-    assert command_line({**part, "episodes": 5}).startswith("python -m vap_core rollout")
+    assert command_line({**part, "episodes": 5}).startswith("./vap rollout")
     warm_up = {**study, "tasks": [["widowx-pick", "pick-straw-cup"]], "follow": "call"}
     del warm_up["follow"]
     assert "rollout --suite widowx-pick --task pick-straw-cup" in command_line(warm_up)
     tabletop = [["tabletop", "select-cup"]]
     told = command_line({**study, "tasks": tabletop, "object": "cup-lookalike-1"})
-    assert told.startswith("python -m vap_core eval --suite tabletop --method vap")
+    assert told.startswith("./vap eval --suite tabletop --method vap")
     assert "--object cup-lookalike-1" in told
     elsewhere = command_line({**study, "tasks": tabletop, "object": "nowhere-known"})
     assert elsewhere.startswith("Study(")

@@ -122,7 +122,7 @@ def test_what_is_to_be_run_next_runs(bank: Path, tmp_path: Path, owner: str) -> 
     for name, more in (("jar", whose), ("bens", ("--owner", "ben")), ("jar-2", whose)):
         done = registered(bank, name, tmp_path / "a.png", *more, category="jar")
         (line,) = (line for line in done.stdout.splitlines() if line.startswith("next: "))
-        words = shlex.split(line.removeprefix("next: python -m vap_core "))
+        words = shlex.split(line.removeprefix("next: ./vap "))
         words[1] = str(tmp_path / "a.png")
         done = vap(*words, "--out", tmp_path / "out")
         assert done.returncode == 0, done.stderr

@@ -224,7 +224,7 @@ def test_the_model_answers_after_a_round_trip_and_a_policy_grows_from_it(
         for name, tensor in kept.items()
         if name.startswith("paligemma")
     )
-    with pytest.raises(BadPolicy, match=r"python -m vap_core train vlm"):
+    with pytest.raises(BadPolicy, match=r"./vap train vlm"):
         load_vlm(tmp_path / "nothing")
 
 

@@ -10,7 +10,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-IN_VENV = ".venv/bin/python -m vap_core"
 
 
 def absent_packages(project: Path) -> "list[str]":
@@ -32,7 +31,7 @@ def without_environment() -> str:
     pinned = ROOT / ".python-version"
     wanted = pinned.read_text(encoding="utf-8").strip() if pinned.is_file() else "3.12"
     venv = ROOT / ".venv" / "bin" / "python"
-    remedy = f"use {IN_VENV}" if venv.is_file() else f"run `make setup`, then {IN_VENV}"
+    remedy = "use ./vap" if venv.is_file() else "run `make setup`, then ./vap"
     absent = absent_packages(ROOT / "pyproject.toml")
     if sys.argv[-1:] == ["doctor"]:
         drivers = [list(Path(r, "vulkan/icd.d").glob("*.json")) for r in ("/usr/share", "/etc")]

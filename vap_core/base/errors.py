@@ -340,5 +340,5 @@ def interrupting(
 def command(*words: str | Path, environment: Mapping[str, str] | None = None) -> str:
     """A command of the package as a line for the shell: every word and variable is quoted."""
     parts = [f"{name}={shlex.quote(setting)}" for name, setting in (environment or {}).items()]
-    parts.append(shlex.join(["python", "-m", "vap_core", *map(str, words)]))
+    parts.append(shlex.join(["./vap", *map(str, words)]))
     return " ".join(parts)

@@ -22,7 +22,7 @@ from vap_core.cli import bench, look, machine, measure, own, run, serve
 HELP = """Visual Attentive Prompting: steer a frozen policy to your own object, and see why it
 worked or failed.
 
-Start with: python -m vap_core doctor, then python -m vap_core demo."""
+Start with: ./vap doctor, then ./vap demo."""
 INTERRUPTED = 130
 AS_WRITTEN = re.compile(r"^(?:--[\w-]+=)?(~\w*|\$\w+|\$\{\w+\})(?:/|$)")
 """How a word begins that the shell expands unless it is quoted."""
@@ -123,7 +123,7 @@ def _run() -> None:
                         f"{word}: the shell left {found[1]} as it is; write the path without "
                         "quotes, and a blank for the =."
                     )
-            app()
+            app(prog_name="./vap")
         finally:
             sys.stdout.flush()
     except VapError as error:

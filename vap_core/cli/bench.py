@@ -691,9 +691,9 @@ def bench(
 ) -> None:
     """Measure what a step, an episode, a model or a run costs, as ratios within one run.
 
-    Example: python -m vap_core bench step
-    Example: python -m vap_core bench profile --json profile.json
-    Example: python -m vap_core bench stack --stack foundation-small:detector=sam3
+    Example: ./vap bench step
+    Example: ./vap bench profile --json profile.json
+    Example: ./vap bench stack --stack foundation-small:detector=sam3
     """
     from vap_core.base.errors import one_of
 

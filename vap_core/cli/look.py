@@ -77,14 +77,14 @@ def diagnose(
     """Say why episodes failed, list them, and open one at the frame that decided it; one that was
     not recorded is run again.
 
-    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method vap
-    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --suite vlabench --case 2
+    Example: ./vap diagnose data/results/mini_pi0.parquet --method vap
+    Example: ./vap diagnose data/results/mini_pi0.parquet --suite vlabench --case 2
         --open 0
-    Example: python -m vap_core diagnose data/results/mini_pi0.parquet --method generic --open 0
+    Example: ./vap diagnose data/results/mini_pi0.parquet --method generic --open 0
         --against vap --png beside.png
-    Example: python -m vap_core diagnose data/runs/demo --where "steps > 20" --open 0
+    Example: ./vap diagnose data/runs/demo --where "steps > 20" --open 0
         --png why.png
-    Example: python -m vap_core diagnose data/runs/demo --open 0 --correct "case 3: slip"
+    Example: ./vap diagnose data/runs/demo --open 0 --correct "case 3: slip"
         --note "it held for a moment"
     """
     from vap_core.base.errors import BadStudy
@@ -149,9 +149,9 @@ def query(
 ) -> None:
     """Ask the steps and the episodes of a run: in which of them, and where, does a condition hold?
 
-    Example: python -m vap_core query data/runs/demo near-miss
-    Example: python -m vap_core query data/runs/demo "margin < 0.05 and success = false" --open 0
-    Example: python -m vap_core query data/runs/demo
+    Example: ./vap query data/runs/demo near-miss
+    Example: ./vap query data/runs/demo "margin < 0.05 and success = false" --open 0
+    Example: ./vap query data/runs/demo
         "select method, camera, avg(track_score) from steps group by method, camera"
     """
     from vap_core.study import steps
@@ -208,9 +208,9 @@ def view(
     """Open a recording in Rerun's viewer, with its analytics and its look for updates turned off;
     or make a picture or a film of it.
 
-    Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd
-    Example: python -m vap_core view data/runs/demo/recordings/NAME.rrd --png shot.png --frame 20
-    Example: python -m vap_core view data/runs/demo/recordings/*franka*000*vap.rrd --mp4 talk.mp4
+    Example: ./vap view data/runs/demo/recordings/*franka*000*vap.rrd
+    Example: ./vap view data/runs/demo/recordings/NAME.rrd --png shot.png --frame 20
+    Example: ./vap view data/runs/demo/recordings/*franka*000*vap.rrd --mp4 talk.mp4
     """
     from vap_core.base.errors import BadStudy
 
@@ -310,9 +310,9 @@ def report(
     """Print and write what runs found: tables with intervals beside the paper's, paired
     comparisons, errors, provenance, pictures.
 
-    Example: python -m vap_core report data/runs/demo
-    Example: python -m vap_core report data/runs/expert-simpler-bridge --rescore
-    Example: python -m vap_core report data/results/scripted.parquet --out data/runs/scripted-report
+    Example: ./vap report data/runs/demo
+    Example: ./vap report data/runs/expert-simpler-bridge --rescore
+    Example: ./vap report data/results/scripted.parquet --out data/runs/scripted-report
     """
     if rescore:
         from vap_core.study.report import rescore as judge_again
@@ -350,11 +350,11 @@ def publish(
 ) -> None:
     """Keep the results of finished runs as one small table, with their configurations.
 
-    Example: python -m vap_core publish data/runs/expert-all data/runs/random-all
+    Example: ./vap publish data/runs/expert-all data/runs/random-all
         --to data/results/bounds.parquet --replace
-    Example: python -m vap_core publish data/results/mine.parquet data/runs/more
+    Example: ./vap publish data/results/mine.parquet data/runs/more
         --to data/results/mine.parquet --replace
-    Example: python -m vap_core publish data/runs/bridge --methods generic,vap
+    Example: ./vap publish data/runs/bridge --methods generic,vap
         --to data/results/bridge.parquet
     """
     from vap_core.study.results import publish as write_table

@@ -58,7 +58,7 @@ def doctor() -> None:
     """Say what works on this machine, and how to repair what does not; status 1 when the main job
     cannot run.
 
-    Example: python -m vap_core doctor
+    Example: ./vap doctor
     """
     # Look at everything; nothing here raises.
     needed = (_python, _gl, _weights, _lists, _rerun)
@@ -101,9 +101,7 @@ def _text_encoder() -> tuple[str, str]:
 
     folder = find_model()
     if folder is None:
-        raise VapError(
-            "fetched at first use (91 MB), or now: python -m vap_core weights pull --stack embedded"
-        )
+        raise VapError("fetched at first use (91 MB), or now: ./vap weights pull --stack embedded")
     return "text encoder", str(folder)
 
 
@@ -241,7 +239,7 @@ def _not_in_view() -> Finding:
 def list_weights() -> None:
     """What is on this machine, what is missing, and how to get it.
 
-    Example: python -m vap_core weights list
+    Example: ./vap weights list
     """
     from vap_core.perception.foundation.weights import weights_table
 
@@ -272,8 +270,8 @@ def pull_weights(
     """Get a stack's weights at their pinned revisions and check them. Interrupted, the same command
     goes on.
 
-    Example: python -m vap_core weights pull --stack foundation-small
-    Example: python -m vap_core weights pull --stack foundation:detector=llmdet-tiny --unpinned
+    Example: ./vap weights pull --stack foundation-small
+    Example: ./vap weights pull --stack foundation:detector=llmdet-tiny --unpinned
     """
     from vap_core.perception.foundation.weights import models_of, pull, store_folder
 
@@ -290,7 +288,7 @@ def export_weights(
 
     Training does this by itself; needed again when a network's structure changes.
 
-    Example: python -m vap_core weights export --folder data/runs/weights
+    Example: ./vap weights export --folder data/runs/weights
     """
     from vap_core.base.files import writing
     from vap_make.perception.graphs import export_graphs
@@ -315,7 +313,7 @@ def perception(
     """Train the heads of detector, segmenter and encoder on rendered generic objects, and evaluate
     them on unseen ones.
 
-    Example: python -m vap_core train perception --out data/runs/weights --scenes 400
+    Example: ./vap train perception --out data/runs/weights --scenes 400
     """
     from vap_make.perception.train import CACHE, train
 
@@ -352,7 +350,7 @@ def demonstrations(
     """Film the scripted expert with generic objects, as a LeRobotDataset v3. Interrupted, the same
     command goes on.
 
-    Example: python -m vap_core train demonstrations --suite simpler-bridge --stages 2
+    Example: ./vap train demonstrations --suite simpler-bridge --stages 2
         --out data/runs/small-demonstrations
     """
     from vap_core.base.errors import one_of
@@ -396,7 +394,7 @@ def vlm(
     """Train the mini-PaliGemma that policies grow from, on questions about generic objects.
     Interrupted, the same command goes on.
 
-    Example: python -m vap_core train vlm --stages 20 --steps 100 --out data/runs/small-vlm
+    Example: ./vap train vlm --stages 20 --steps 100 --out data/runs/small-vlm
     """
     from vap_core.base.errors import command
     from vap_make.films.scenes import CACHE
@@ -483,9 +481,9 @@ def policy(
     """Train a mini-pi0, the small frozen policy, from nothing, by the recipe of its suite: one to
     five CPU hours. Interrupted, the same command goes on.
 
-    Example: python -m vap_core train policy --suite simpler-bridge --stages 40 --steps 500
+    Example: ./vap train policy --suite simpler-bridge --stages 40 --steps 500
         --vlm data/policies/mini-paligemma-tint-free --out data/runs/small-policy
-    Example: python -m vap_core train policy --suite simpler-fractal --seed 1 --device cuda
+    Example: ./vap train policy --suite simpler-fractal --seed 1 --device cuda
     """
     from dataclasses import replace
 

@@ -55,7 +55,7 @@ def eval_perception(asked: OfPerception) -> None:
     """Measure perception against the simulator: opening frames, tracks through whole expert
     episodes, and time. Interrupted, it goes on.
 
-    Example: python -m vap_core measure perception --suite simpler-bridge --quick
+    Example: ./vap measure perception --suite simpler-bridge --quick
     """
     from vap_core.perception.foundation.weights import check_present
     from vap_core.perception.stacks import check_stack
@@ -102,8 +102,8 @@ def eval_photos(asked: OfPhotos) -> None:
     """Measure registering, grounding and the vote on photos of your own, against the boxes that you
     give. Interrupted, it goes on.
 
-    Example: python -m vap_core measure photos my-photos
-    Example: python -m vap_core measure photos my-photos --clips
+    Example: ./vap measure photos my-photos
+    Example: ./vap measure photos my-photos --clips
     """
     from vap_core.study.photos import measure_photos
 
@@ -146,7 +146,7 @@ def eval_objects(asked: OfObjects) -> None:
     look-alikes: found in opening views, and fetched by VAP where the expert can. Interrupted, it
     goes on.
 
-    Example: python -m vap_core measure objects data/scans
+    Example: ./vap measure objects data/scans
     """
     from vap_core.study.objects import ObjectMeasurement, measure_objects
 
@@ -189,8 +189,8 @@ def calibrate(
     """Measure from which cosine on an object is in view: what each threshold costs and brings, on
     development scenes with and without the object. Interrupted, it goes on.
 
-    Example: python -m vap_core measure calibration --scenes 8
-    Example: python -m vap_core measure calibration --photos my-photos --scenes 0 --keep
+    Example: ./vap measure calibration --scenes 8
+    Example: ./vap measure calibration --photos my-photos --scenes 0 --keep
     """
     from vap_make.calibration.run import calibrate, keep_choice, refuse_keep
 
@@ -238,8 +238,8 @@ class OfParsers:
 def eval_parsers(asked: OfParsers) -> None:
     """Parse over 200 paraphrased instructions a suite, and print how often the object is right.
 
-    Example: python -m vap_core measure parsers
-    Example: python -m vap_core measure parsers --parser chat --part test --limit 20
+    Example: ./vap measure parsers
+    Example: ./vap measure parsers --parser chat --part test --limit 20
     """
     import pandas as pd
 
@@ -280,8 +280,8 @@ def eval_policy(
     """Measure what a policy can do with generic objects that no film has shown, told by a tint, by
     its real colour, by words, or not at all.
 
-    Example: python -m vap_core measure policy --suite simpler-bridge --scenes 4
-    Example: python -m vap_core measure policy --suite simpler-bridge --ways tinted,coloured
+    Example: ./vap measure policy --suite simpler-bridge --scenes 4
+    Example: ./vap measure policy --suite simpler-bridge --ways tinted,coloured
     """
     from vap_core.base.errors import BadStudy
     from vap_core.simulation import suites
@@ -324,7 +324,7 @@ def eval_obedience(
     """Does a policy obey a tint? True, wrong and no masks on the same 30 to 150 episodes, stopped
     as soon as it is known; a page with one sentence and two recordings. Interrupted, it goes on.
 
-    Example: python -m vap_core measure obedience --policy "ws://gpu:8000?map=bridge"
+    Example: ./vap measure obedience --policy "ws://gpu:8000?map=bridge"
         --suite simpler-bridge
     """
     from vap_core.base.errors import BadStudy
@@ -362,7 +362,7 @@ def eval_tokens(asked: OfTokens) -> None:
     listed episodes the model chooses by it. Interrupted, it goes on; about a minute and a half a
     token and core.
 
-    Example: python -m vap_core measure tokens --suite simpler-bridge --k 5 --epochs 2
+    Example: ./vap measure tokens --suite simpler-bridge --k 5 --epochs 2
         --out data/runs/few-tokens
     """
     from vap_core.base.errors import BadStudy
@@ -407,8 +407,8 @@ def embeddings(
     """Compare the word embeddings of a vision-language model with those of policies: cosine, CKA,
     kNN@1, with the paper's numbers below.
 
-    Example: python -m vap_core measure embeddings
-    Example: python -m vap_core measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
+    Example: ./vap measure embeddings
+    Example: ./vap measure embeddings models/paligemma-3b-pt-224 models/pi0 models/pi05
     """
 
     from vap_core.base.errors import BadPolicy
@@ -484,9 +484,9 @@ def attention(
     """Run the episodes of a run again, measure where every query looks, and print the patterns; or
     record one of them with its maps.
 
-    Example: python -m vap_core measure attention data/results/mini_pi0.parquet --method soft,vap
+    Example: ./vap measure attention data/results/mini_pi0.parquet --method soft,vap
         --suite vlabench
-    Example: python -m vap_core measure attention data/results/mini_pi0.parquet
+    Example: ./vap measure attention data/results/mini_pi0.parquet
         --record simpler-bridge/pick-shaver/soft/12
     """
     from vap_core.base.errors import command

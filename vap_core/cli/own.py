@@ -83,12 +83,12 @@ def register(
 ) -> None:
     """Remember a personal object from photos; a contact sheet beside the memory shows the crops.
 
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg
-    Example: python -m vap_core register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
-    Example: python -m vap_core register mug --category cup --video mug.mp4
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg
+    Example: ./vap register mug --category cup photos/mug-*.jpg
+    Example: ./vap register mug --category cup mug.jpg --box mug.jpg=40,60,180,220
+    Example: ./vap register mug --category cup --video mug.mp4
+    Example: ./vap register mug --category cup photos/mug-*.jpg
         --stack embedded:encoder=dinov2-small
-    Example: python -m vap_core register mug --category cup photos/mug-*.jpg --owner anna
+    Example: ./vap register mug --category cup photos/mug-*.jpg --owner anna
         --note "for the morning coffee"
     """
     import dataclasses
@@ -189,11 +189,11 @@ def ground(
 ) -> None:
     """Find a remembered object in a picture, and show why that box won; or track it through a clip.
 
-    Example: python -m vap_core ground desk.jpg "bring my cup"
-    Example: python -m vap_core ground desk.jpg "bring my cup" --box 40,60,180,220
+    Example: ./vap ground desk.jpg "bring my cup"
+    Example: ./vap ground desk.jpg "bring my cup" --box 40,60,180,220
         --box 300,80,420,230
-    Example: python -m vap_core ground desk.mp4 "bring my cup"
-    Example: python -m vap_core ground desk.jpg "bring the one I used last" --parser embedding
+    Example: ./vap ground desk.mp4 "bring my cup"
+    Example: ./vap ground desk.jpg "bring the one I used last" --parser embedding
         --speaker anna
     """
     from vap_core.base.errors import BadInstruction, command
@@ -339,7 +339,7 @@ def import_object(
 ) -> None:
     """Make an object of your own 3-D scan, in some seconds, and a picture of it beside it.
 
-    Example: python -m vap_core objects import mug.glb --category cup --height-cm 9
+    Example: ./vap objects import mug.glb --category cup --height-cm 9
     """
     from vap_core.base.errors import an, command
     from vap_core.simulation.assets.objects import extent_m, load_scanned_object
@@ -393,7 +393,7 @@ def import_object(
 def list_objects() -> None:
     """Every object there is, your own last.
 
-    Example: python -m vap_core objects list
+    Example: ./vap objects list
     """
     from vap_core.simulation.assets.objects import object_table
 
@@ -402,13 +402,13 @@ def list_objects() -> None:
 
 @objects.command()
 def photograph(
-    name: Annotated[str, typer.Argument(help="An object; see python -m vap_core objects list.")],
+    name: Annotated[str, typer.Argument(help="An object; see ./vap objects list.")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("data/photos"),
     views: Annotated[int, typer.Option(min=1, max=20, help="Pictures, taken all around it.")] = 5,
 ) -> None:
     """Take reference photos of an object, as one walks around it.
 
-    Example: python -m vap_core objects photograph camera-personal --out data/photos/camera
+    Example: ./vap objects photograph camera-personal --out data/photos/camera
     """
     from vap_core.base.errors import command
     from vap_core.simulation.assets.objects import get_object
@@ -443,7 +443,7 @@ def attach_command(
 
     Its files are linked, not changed; one step is added to its preprocessor.
 
-    Example: python -m vap_core attach data/policies/mini-pi0-simpler-bridge-wide-seed-0
+    Example: ./vap attach data/policies/mini-pi0-simpler-bridge-wide-seed-0
         data/runs/mine --memory data/runs/bridge/memory
     """
     from vap_core.base.errors import require
@@ -518,8 +518,8 @@ def inspect_dataset_command(
     """Ground and track a remembered object through recorded episodes: where a view does not find
     it or loses it. Interrupted, the same command goes on.
 
-    Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup"
-    Example: python -m vap_core inspect-dataset ~/datasets/desk "pick my cup" --episodes 3
+    Example: ./vap inspect-dataset ~/datasets/desk "pick my cup"
+    Example: ./vap inspect-dataset ~/datasets/desk "pick my cup" --episodes 3
         --copy ~/datasets/desk-vap
     """
     from vap_core.base.errors import require

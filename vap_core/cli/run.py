@@ -197,7 +197,7 @@ def demo(asked: AskedOfDemo) -> None:
     """The main job: personalise a scripted policy on two robots, generic against VAP, with
     recordings of every episode.
 
-    Example: python -m vap_core demo --episodes 20
+    Example: ./vap demo --episodes 20
     """
     from vap_core.study.engine import start_server
 
@@ -212,7 +212,7 @@ def demo(asked: AskedOfDemo) -> None:
 def suites() -> None:
     """List the benchmarks: robots, cameras, tasks, episodes, and the hashes of their episode lists.
 
-    Example: python -m vap_core suites
+    Example: ./vap suites
     """
     from vap_core.study.report import suites_table
 
@@ -225,9 +225,9 @@ def rollout(asked: Asked) -> None:
     """Run tasks of a suite in closed loop, 20 episodes each, track at every step, record every
     episode, and print the table.
 
-    Example: python -m vap_core rollout --suite widowx-pick --task pick-bottle --episodes 4
+    Example: ./vap rollout --suite widowx-pick --task pick-bottle --episodes 4
         --out data/runs/bottle
-    Example: python -m vap_core rollout --suite tabletop --task select-cup --object mug
+    Example: ./vap rollout --suite tabletop --task select-cup --object mug
         --episodes 4 --out data/runs/mug
     """
     given = {field.name: getattr(asked, field.name) for field in fields(Asked)}
@@ -242,13 +242,13 @@ def evaluate(asked: AskedOfAll) -> None:
     """Run whole suites, and print the table with 95 % intervals. Interrupted, the same command goes
     on. With --object, the tasks of its category.
 
-    Example: python -m vap_core eval --suite simpler-bridge --policy scripted
+    Example: ./vap eval --suite simpler-bridge --policy scripted
         --methods generic,vap --episodes 4 --out data/runs/bridge
-    Example: python -m vap_core eval --suite simpler-bridge --policy expert
-    Example: python -m vap_core eval --suite tabletop --object mug --out data/runs/mug-all
-    Example: python -m vap_core eval --suite all --methods generic,vap --episodes 4
+    Example: ./vap eval --suite simpler-bridge --policy expert
+    Example: ./vap eval --suite tabletop --object mug --out data/runs/mug-all
+    Example: ./vap eval --suite all --methods generic,vap --episodes 4
         --out data/runs/all
-    Example: python -m vap_core eval --suite all --ray 10.0.0.5:6379
+    Example: ./vap eval --suite all --ray 10.0.0.5:6379
     """
     run_suites(asked)
 
@@ -285,9 +285,9 @@ def ablate(asked: AskedOfAblation) -> None:
     """Change one thing of the method at a time, and compare every arm with the method itself on the
     same episodes; draws OUT/NAME.png. Interrupted, the same command goes on.
 
-    Example: python -m vap_core ablate
-    Example: python -m vap_core ablate form --suite simpler-bridge --episodes 6
-    Example: python -m vap_core ablate rewrite --suite simpler-fractal --split "visual matching"
+    Example: ./vap ablate
+    Example: ./vap ablate form --suite simpler-bridge --episodes 6
+    Example: ./vap ablate rewrite --suite simpler-fractal --split "visual matching"
     """
     from vap_core.base.errors import BadStudy, one_of
     from vap_core.study.methods import ABLATIONS
@@ -301,7 +301,7 @@ def ablate(asked: AskedOfAblation) -> None:
             of = f"; of the policies {', '.join(about.policies)}" if about.policies else ""
             rows.append([each, about.question, ", ".join(about.names) + of])
         print(printed(rows))
-        print("next: python -m vap_core ablate form --suite simpler-bridge --episodes 6")
+        print("next: ./vap ablate form --suite simpler-bridge --episodes 6")
         return
     if name not in ABLATIONS:
         raise one_of("ablate: ablation", name, ABLATIONS)
@@ -380,7 +380,7 @@ def study_of(asked: AskedOfAll) -> "Study":
     if not tasks:
         raise BadStudy(
             f"--object: {asked.object} is {an(get_object(asked.object).category)}, and no task of "
-            f"{', '.join(suite_names)} asks for one; python -m vap_core suites lists the tasks."
+            f"{', '.join(suite_names)} asks for one; ./vap suites lists the tasks."
         )
     policy = asked.policy or default_policy(suite_names)
     methods = asked.methods

@@ -84,10 +84,10 @@ def serve(asked: AskedOfServe) -> None:
     """Stand between any client and any policy server, and prompt what passes; or serve a policy.
     Ctrl-C ends it.
 
-    Example: python -m vap_core serve --upstream ws://gpu:8000 --memory data/memory
+    Example: ./vap serve --upstream ws://gpu:8000 --memory data/memory
         --record data/runs/served
-    Example: python -m vap_core serve --upstream ws://gpu:8000 --dry --record data/runs/flight
-    Example: python -m vap_core serve --policy mini-pi0 --suite simpler-bridge --port 8000
+    Example: ./vap serve --upstream ws://gpu:8000 --dry --record data/runs/flight
+    Example: ./vap serve --policy mini-pi0 --suite simpler-bridge --port 8000
     """
     from vap_core.base.errors import BadStudy
     from vap_core.policies.wires import wire_of

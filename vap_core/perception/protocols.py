@@ -232,7 +232,7 @@ def thresholds_file(folder: Path, kind: str) -> Path:
 def keep_command(kind: str, photos: bool) -> str:
     """The command that measures a stack's thresholds and keeps them, on photos too where asked."""
     on_photos = " --photos SET" if photos else ""
-    return f"python -m vap_core measure calibration --stack {kind}{on_photos} --keep"
+    return f"./vap measure calibration --stack {kind}{on_photos} --keep"
 
 
 def keep_thresholds(folder: Path, kind: str, encoder: str, thresholds: Thresholds) -> Path:

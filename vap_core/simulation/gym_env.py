@@ -166,7 +166,7 @@ class VapEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         if row.subgoals:
             raise BadSuite(
                 f"gym: episodes of {row.suite} have sub-goals, and the reward here is of one; run "
-                "them by: python -m vap_core eval"
+                "them by: ./vap eval"
             )
         scene = self._scene(row)
         self._env = make_env(scene, self.suite.name, image_size=self.image_size)

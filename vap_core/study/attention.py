@@ -471,7 +471,7 @@ def read(folder: Path) -> "dict[str, pd.DataFrame]":
         path = folder / f"{PREFIX}{name}.parquet"
         if not path.exists():
             raise BadOutput(
-                f"attention: {path} is missing; make it: python -m vap_core measure attention RUN "
+                f"attention: {path} is missing; make it: ./vap measure attention RUN "
                 f"--publish {folder}"
             )
         tables[name] = read_parquet(path, "attention", "publish it again")

@@ -82,8 +82,7 @@ def read_source(folder: Path) -> Source:
     """Read a folder in either form. Raises: BadObject, which names the line."""
     if not folder.is_dir():
         raise BadObject(
-            f"measure objects: {folder} is no folder; see python -m vap_core measure objects "
-            "--help."
+            f"measure objects: {folder} is no folder; see ./vap measure objects --help."
         )
     if not (folder / TABLE).exists():
         return _imported(folder)

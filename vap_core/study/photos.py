@@ -129,7 +129,7 @@ def read_photo_set(folder: Path) -> PhotoSet:
     Raises: BadPhotoSet: something is missing, or a line does not fit; the message names it.
     """
     if not folder.is_dir():
-        raise _wrong(f"{folder} is no folder; see python -m vap_core measure photos --help.")
+        raise _wrong(f"{folder} is no folder; see ./vap measure photos --help.")
     photos = _read_references(folder)
     scenes = _read_scenes(folder, photos)
     shown = {name for scene in scenes for name in scene.boxes}

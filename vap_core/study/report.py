@@ -218,7 +218,7 @@ FAILURES_NOTE = (
     "instances. Case 3: the prompt is right, the\n"
     "manipulation fails. Unprompted: the method highlights nothing. Confidence: the share of "
     "neighbouring thresholds under which a label stays the same.\n"
-    "`python -m vap_core diagnose` lists the failures and opens one at the frame that decided it; "
+    "`./vap diagnose` lists the failures and opens one at the frame that decided it; "
     "runs older than the diagnosis are left out."
 )
 ABSTENTION_NOTE = (
@@ -453,7 +453,7 @@ def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list
     if len(rows) > len(cards):
         parts.append(
             f"<p>{len(rows) - len(cards)} more without a picture here: "
-            "<code>python -m vap_core diagnose RUN</code> lists all of them, and records what was "
+            "<code>./vap diagnose RUN</code> lists all of them, and records what was "
             "not recorded.</p>"
         )
     return parts

@@ -109,7 +109,7 @@ class Tokens(Measurement):
         for name in self.suites:
             if not shipped(name).is_dir():
                 raise BadStudy(
-                    f"measure tokens: no mini-pi0 for {name} ships; run: python -m vap_core train "
+                    f"measure tokens: no mini-pi0 for {name} ships; run: ./vap train "
                     f"policy --suite {name}"
                 )
 

@@ -293,7 +293,7 @@ def _check_policy(study: Study) -> None:
         if policy == MINI and not shipped(suite).is_dir():
             there = ", ".join(sorted(path.name for path in SHIPPED.glob(f"{MINI}-*"))) or "none"
             raise BadStudy(
-                f"Study: no {MINI} for {suite} ships (there is {there}); run: python -m vap_core "
+                f"Study: no {MINI} for {suite} ships (there is {there}); run: ./vap "
                 f"train policy --suite {suites.benchmark_name(suite)}"
             )
     if study.temperature is not None:

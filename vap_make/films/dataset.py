@@ -1,6 +1,6 @@
 """Demonstrations as a LeRobotDataset v3, on which any of lerobot's policies can be trained.
 
-    python -m vap_core train demonstrations --suite simpler-bridge --stages 400 --out FOLDER
+    ./vap train demonstrations --suite simpler-bridge --stages 400 --out FOLDER
 
 A film is an episode, and it comes back bit for bit. lerobot's policies see
 `observation.images.<camera>` (lossless video), `observation.state`, `action` and the task in
@@ -70,9 +70,7 @@ CODEC: dict[str, Any] = {
 x265's preset "slow" changes pixels of noise all the same, and lerobot cannot join short clips with
 B-frames.
 """
-AGAIN = (
-    "write it again with: python -m vap_core train demonstrations --suite NAME --out OTHER_FOLDER"
-)
+AGAIN = "write it again with: ./vap train demonstrations --suite NAME --out OTHER_FOLDER"
 
 
 def data_sha256(films: Iterable[Film]) -> str:
@@ -204,7 +202,7 @@ def about(folder: Path) -> dict[str, Any]:
             )
         raise BadOutput(
             f"read: {folder} holds no demonstrations; make them with: "
-            "python -m vap_core train demonstrations --suite NAME --out FOLDER."
+            "./vap train demonstrations --suite NAME --out FOLDER."
         )
     try:
         card = parse_json(read_file(folder / ABOUT))

@@ -1,6 +1,6 @@
 """Train the embedded stack's heads on rendered generic objects.
 
-    python -m vap_core train perception --out data/runs/weights --scenes 6480 --seed 0
+    ./vap train perception --out data/runs/weights --scenes 6480 --seed 0
 
 Detector, segmenter and instance head are fitted to frozen features and tested on unseen instances.
 Everything is kept in data/cache/perception and found again after an interruption: stages, features,
@@ -162,7 +162,7 @@ def _describe_training(scenes: int, seed: int, stages: Sequence[Shots]) -> dict[
     """What the manifest says of the training."""
     n_views = sum(len(shots.rgb) for shots in stages)
     return {
-        "command": f"python -m vap_core train perception --scenes {scenes} --seed {seed}",
+        "command": f"./vap train perception --scenes {scenes} --seed {seed}",
         "trained_on": f"{n_views} views of generic objects in {len(stages)} rendered scenes, "
         "and portraits; no evaluation object",
         "seed": seed,

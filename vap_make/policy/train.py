@@ -1,6 +1,6 @@
 """Train a mini-pi0 on filmed demonstrations (P 5.1).
 
-    python -m vap_core train policy --suite simpler-bridge --seed 0
+    ./vap train policy --suite simpler-bridge --seed 0
 
 From nothing: the films, the mini-PaliGemma that the policy grows from, the descriptions of the
 objects, learned words for some of them, and the policy. Each is kept, so that the same command goes
@@ -436,8 +436,7 @@ def _require_trainable(recipe: Recipe, films: Sequence[Film]) -> None:
 
 def _shows_held_out(what: str) -> BadOutput:
     return BadOutput(
-        f"train policy: the films show {what}; film them again: python -m vap_core train "
-        "demonstrations."
+        f"train policy: the films show {what}; film them again: ./vap train demonstrations."
     )
 
 
@@ -450,7 +449,7 @@ def initialise_policy(vlm: MiniVlm, policy: Any) -> None:
         if getattr(policy.config, name) != getattr(vlm.config, name):
             raise BadPolicy(
                 f"vlm.initialise_policy: policy and mini-PaliGemma differ in {name}; make the "
-                "model again: python -m vap_core train vlm"
+                "model again: ./vap train vlm"
             )
     paligemma = policy.model.paligemma_with_expert.paligemma
     paligemma.load_state_dict(vlm.towers.paligemma.state_dict())

@@ -1,6 +1,6 @@
 """Train a mini-PaliGemma on questions about rendered views (P 5.1, SPEC section 4).
 
-    python -m vap_core train vlm --out data/runs/mini-paligemma
+    ./vap train vlm --out data/runs/mini-paligemma
 
 The views show generic objects; policies grow from the model. Its loss is of the answers' words and,
 in training only, of the patches that show the object meant, asked of the penultimate layer.

@@ -257,7 +257,7 @@ def locked_sha256(kind: str) -> dict[str, str]:
 
 def remedy(kind: str) -> str:
     """How to get a stack's weights, online and offline. Raises: UnknownName: no such stack."""
-    pull = f"python -m vap_core weights pull --stack {kind}"
+    pull = f"./vap weights pull --stack {kind}"
     if any(not MODELS[name].sha256 for name in models_of(kind)):
         pull += " --unpinned"
     return (

@@ -1,6 +1,6 @@
 """VAP inside lerobot: a processor step for any of its policies, and our suites as an environment.
 
-    python -m vap_core attach CHECKPOINT personalised --memory data/memory
+    ./vap attach CHECKPOINT personalised --memory data/memory
     lerobot-eval --policy.path=personalised --env.type=vap --env.task=simpler-bridge/put-camera \\
         --seed=0
 

@@ -259,6 +259,6 @@ def _row(config: VapSo101TwinConfig) -> EpisodeRow:
     if row.subgoals:
         raise BadStudy(
             f"vap_so101_twin: episodes of {config.task} have sub-goals, and the outcome here is of "
-            "one; run them by: python -m vap_core eval"
+            "one; run them by: ./vap eval"
         )
     return row

@@ -128,8 +128,7 @@ def load_vlm(folder: Path) -> MiniVlm:
     """The frozen model that `save` wrote. Raises: BadPolicy."""
     if not (folder / WEIGHTS).is_file():
         raise BadPolicy(
-            f"load_vlm: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: "
-            "python -m vap_core train vlm"
+            f"load_vlm: {folder} holds no mini-PaliGemma ({WEIGHTS}); make one: ./vap train vlm"
         )
     try:
         vlm = MiniVlm(cast(MiniPI0Config, PreTrainedConfig.from_pretrained(folder)))
@@ -139,7 +138,7 @@ def load_vlm(folder: Path) -> MiniVlm:
     except Exception as error:
         raise BadPolicy(
             f"load_vlm: {folder} is damaged ({type(error).__name__}: {first_line(error):.150}); "
-            "run: python -m vap_core train vlm"
+            "run: ./vap train vlm"
         ) from error
     return vlm.eval().requires_grad_(False)
 
@@ -166,7 +165,7 @@ def load_from_policy(folder: Path) -> MiniVlm:
         raise BadPolicy(
             f"load_from_policy: {folder} is no mini-pi0 ({type(error).__name__}: "
             f"{first_line(error):.120}); leave soft-own out, or give one: "
-            "python -m vap_core train policy"
+            "./vap train policy"
         ) from error
     return vlm.eval().requires_grad_(False)
 
