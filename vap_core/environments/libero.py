@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from vap_core.attend import GROUNDING_PX
 from vap_core.base.errors import MissingPart
 from vap_core.base.types import Camera, Mask, Rgb, Views, value
 from vap_core.simulation import cameras as optics
@@ -278,9 +279,22 @@ class Simulator:
         return self.env.sim.data._data
 
 
-_LAST: dict[str, tuple[list[Simulator], dict[int, mujoco.Renderer]]] = {}
-"""The last problem, as 0.4 GB a simulator and 0.9 GB a renderer: its idle simulators, and what
-draws any of them (their models are equal), by the side of the picture."""
+class Renderer(mujoco.Renderer):
+    """Draws square pictures of any size up to its own: one more would take 0.9 GB for textures."""
+
+    def __init__(self, model: mujoco.MjModel, largest: int) -> None:
+        buffer = model.vis.global_
+        buffer.offheight = buffer.offwidth = self.largest = largest
+        super().__init__(model, largest, largest)
+
+    def sized(self, side: int) -> "Renderer":
+        self._width = self._height = self._rect.width = self._rect.height = side
+        return self
+
+
+_LAST: dict[str, tuple[list[Simulator], list[Renderer]]] = {}
+"""Of the last problem the idle simulators, 0.4 GB each, and what draws any of them, as their models
+are equal."""
 
 
 class LiberoWorld:
@@ -295,8 +309,8 @@ class LiberoWorld:
         problem = self.personal.problem
         if problem not in _LAST:
             _LAST.clear()
-            _LAST[problem] = [], {}
-        self._free, self.renderers = _LAST[problem]
+            _LAST[problem] = [], []
+        self._free, self._drawn = _LAST[problem]
         if not self._free:
             self._free.append(self._simulator())
         objects = self._free[0].env.objects_dict
@@ -321,6 +335,11 @@ class LiberoWorld:
         env = LiberoEnv(self, simulator, image_size, cameras)
         weakref.finalize(env, self._free.append, simulator)
         return env
+
+    def renderer(self, model: mujoco.MjModel, side: int) -> Renderer:
+        if not self._drawn or self._drawn[0].largest < side:
+            self._drawn[:] = [Renderer(model, max(side, GROUNDING_PX))]
+        return self._drawn[0].sized(side)
 
     def close(self) -> None:
         """Keeps the simulators, for the problem's other tasks."""
@@ -408,20 +427,12 @@ class LiberoEnv:
 
     def _views(self, side: int) -> Views:
         with self._timed("render"):
-            renderer = self._renderer(side)
+            renderer = self.world.renderer(self._simulator.model, side)
             views = {}
             for name in self.camera_names:
                 renderer.update_scene(self._simulator.data, name, _SHOWN)
                 views[name] = renderer.render()
         return views
-
-    def _renderer(self, side: int) -> mujoco.Renderer:
-        found = self.world.renderers
-        if side not in found:
-            buffer = self._simulator.model.vis.global_
-            buffer.offheight = buffer.offwidth = max(side, buffer.offheight, buffer.offwidth)
-            found[side] = mujoco.Renderer(self._simulator.model, side, side)
-        return found[side]
 
     def state(self) -> Float32[np.ndarray, " s"]:
         """As types.Observation says; of the position, the base stands on the table top."""
@@ -484,7 +495,7 @@ class LiberoEnv:
             )
 
     def _masks(self, camera: str) -> tuple[dict[str, Mask], Mask]:
-        renderer = self._renderer(self.image_size)
+        renderer = self.world.renderer(self._simulator.model, self.image_size)
         renderer.enable_segmentation_rendering()
         renderer.update_scene(self._simulator.data, camera, _SHOWN)
         drawn = renderer.render()

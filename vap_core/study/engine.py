@@ -200,6 +200,7 @@ def run_job(job: Job) -> Rows:
         BadOutput.
     """
     from vap_core.rollout.loop import rollout
+    from vap_core.simulation.scenes import Scene
 
     job.study.open_suites()
     trial = make_trial(job.study, job.rows, job.method, job.folder / "memory")
@@ -216,7 +217,8 @@ def run_job(job: Job) -> Rows:
         policy_timeout_s=job.policy_timeout_s,
     )
     with unchanged_weights(trial.policy) as checksum:
-        episodes = list(rollout(trial, job.rows, begin, batch=BATCH))
+        batch = BATCH if isinstance(trial.scene, Scene) else 1  # other libraries' take memory
+        episodes = list(rollout(trial, job.rows, begin, batch=batch))
     steps.write(job.folder, episodes)
     logs.write_states(job.folder, episodes)
     logs.write_audit(job.folder, episodes)
