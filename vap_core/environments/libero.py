@@ -12,7 +12,7 @@ import warnings
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, lru_cache
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -264,21 +264,6 @@ def find_object(name: str) -> ObjectModel | None:
     return ObjectModel(name, KINDS[kind], "foreign", about, plain, 0.1, form=Form(kind))
 
 
-@dataclass
-class Simulator:
-    """LIBERO's environment of a problem."""
-
-    env: Any
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        return self.env.sim.model._model
-
-    @property
-    def data(self) -> mujoco.MjData:
-        return self.env.sim.data._data
-
-
 class Renderer(mujoco.Renderer):
     """Draws square pictures of any size up to its own: one more would take 0.9 GB for textures."""
 
@@ -292,13 +277,13 @@ class Renderer(mujoco.Renderer):
         return self
 
 
-_LAST: dict[str, tuple[list[Simulator], list[Renderer]]] = {}
-"""Of the last problem the idle simulators, 0.4 GB each, and what draws any of them, as their models
-are equal."""
+_LAST: dict[str, tuple[list[Any], list[Renderer]]] = {}
+"""Of the last problem LIBERO's idle environments, 0.4 GB each, and what draws any of them, as their
+models are equal."""
 
 
 class LiberoWorld:
-    """The problem of one task; environments take turns with its simulators."""
+    """The problem of one task; episodes take turns with LIBERO's environments of it."""
 
     image_size: int = IMAGE_PX
     cameras: tuple[str, ...] = CAMERAS
@@ -312,8 +297,8 @@ class LiberoWorld:
             _LAST[problem] = [], []
         self._free, self._drawn = _LAST[problem]
         if not self._free:
-            self._free.append(self._simulator())
-        objects = self._free[0].env.objects_dict
+            self._free.append(self._build())
+        objects = self._free[0].objects_dict
         self.bodies = {name: each.root_body for name, each in objects.items()}
         self.sizes_m = {name: extent_m(get_object(name)) for name in self.bodies}
         self.origin_m = self._origin_m()
@@ -331,9 +316,9 @@ class LiberoWorld:
         return tuple(self.bodies)
 
     def open(self, image_size: int = IMAGE_PX, cameras: Sequence[str] = CAMERAS) -> "LiberoEnv":
-        simulator = self._free.pop() if self._free else self._simulator()
-        env = LiberoEnv(self, simulator, image_size, cameras)
-        weakref.finalize(env, self._free.append, simulator)
+        libero = self._free.pop() if self._free else self._build()
+        env = LiberoEnv(self, libero, image_size, cameras)
+        weakref.finalize(env, self._free.append, libero)
         return env
 
     def renderer(self, model: mujoco.MjModel, side: int) -> Renderer:
@@ -342,13 +327,14 @@ class LiberoWorld:
         return self._drawn[0].sized(side)
 
     def close(self) -> None:
-        """Keeps the simulators, for the problem's other tasks."""
+        """Keeps what is built, for the problem's other tasks."""
 
     def _origin_m(self) -> Float64[np.ndarray, "3"]:
         """The point of the table top below the robot's base, in LIBERO's world."""
-        env, model, data = self._free[0].env, self._free[0].model, self._free[0].data
-        env.sim.set_state_from_flattened(initial_states(self.personal.problem)[0])
-        env.sim.forward()
+        sim = self._free[0].sim
+        model, data = sim.model._model, sim.data._data
+        sim.set_state_from_flattened(initial_states(self.personal.problem)[0])
+        sim.forward()
         target = data.body(self.bodies[self.personal.target])
         groups = np.isin(np.arange(6), (COLLISION, VISUAL)).astype(np.uint8)
         found, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
@@ -356,19 +342,18 @@ class LiberoWorld:
         base = data.body("robot0_base").xpos
         return np.array([base[0], base[1], target.xpos[2] - depth])
 
-    def _simulator(self) -> Simulator:
-        """One more. Where its fixtures stand is drawn from the same seed each time."""
+    def _build(self) -> Any:
+        """LIBERO's environment. Where its fixtures stand is drawn from the same seed each time."""
         with _silenced():
             from libero.libero.envs.env_wrapper import ControlEnv
 
             bddl = _folder("bddl_files") / f"{self.personal.problem}.bddl"
-            made = ControlEnv(
+            return ControlEnv(
                 bddl_file_name=str(bddl),
                 use_camera_obs=False,
                 has_offscreen_renderer=False,
                 ignore_done=True,
-            )
-        return Simulator(made.env)
+            ).env
 
 
 class LiberoEnv:
@@ -381,16 +366,17 @@ class LiberoEnv:
     action_names: tuple[str, ...] = EE_ACTION
 
     def __init__(
-        self, world: LiberoWorld, simulator: Simulator, image_size: int, cameras: Sequence[str]
+        self, world: LiberoWorld, libero: Any, image_size: int, cameras: Sequence[str]
     ) -> None:
         self.world = world
         self.image_size = image_size
         self.camera_names = tuple(cameras)
         self.seconds = dict.fromkeys(("physics", "render", "truth"), 0.0)
-        self._simulator = simulator
+        self._libero = libero
+        self._model = model = libero.sim.model._model
+        self._data = libero.sim.data._data
         self._steps = 0
         self._pressed_s: dict[str, float] = {}
-        model = simulator.model
         names = [model.body(model.body_rootid[body]).name for body in model.geom_bodyid]
         owners = {body: name for name, body in world.bodies.items()}
         self._roles = np.array([owners.get(name, REST) for name in names], object)
@@ -405,7 +391,7 @@ class LiberoEnv:
     def reset(self, row: EpisodeRow) -> None:
         """Start from the row's initial state, and let everything settle."""
         self.row = row
-        env = self._simulator.env
+        env = self._libero
         task = self.world.personal
         env.parsed_problem["goal_state"] = [[task.predicate, task.target, task.place]]
         env.sim.reset()
@@ -427,16 +413,16 @@ class LiberoEnv:
 
     def _views(self, side: int) -> Views:
         with self._timed("render"):
-            renderer = self.world.renderer(self._simulator.model, side)
+            renderer = self.world.renderer(self._model, side)
             views = {}
             for name in self.camera_names:
-                renderer.update_scene(self._simulator.data, name, _SHOWN)
+                renderer.update_scene(self._data, name, _SHOWN)
                 views[name] = renderer.render()
         return views
 
     def state(self) -> Float32[np.ndarray, " s"]:
         """As types.Observation says; of the position, the base stands on the table top."""
-        data, robot = self._simulator.data, self._simulator.env.robots[0]
+        data, robot = self._data, self._libero.robots[0]
         grip = data.site("gripper0_grip_site")
         turn = rotation_vector(grip.xmat.reshape(3, 3) @ DOWN.T)
         fingers = data.qpos[robot._ref_gripper_joint_pos_indexes]
@@ -449,7 +435,7 @@ class LiberoEnv:
         """LIBERO's controller takes shares of its longest step, and a gripper from -1 (open)."""
         share = np.clip(self._shares(action), -1.0, 1.0)
         with self._timed("physics"):
-            self._simulator.env.step(np.array([*share, 1.0 - 2.0 * action[-1]]))
+            self._libero.step(np.array([*share, 1.0 - 2.0 * action[-1]]))
         self._steps += 1
         pressed = self._touching(self._hand)
         self._pressed_s = {name: self._pressed_s.get(name, 0.0) + 1 / HZ for name in pressed}
@@ -462,13 +448,13 @@ class LiberoEnv:
 
     def _touching(self, part: np.ndarray) -> list[str]:
         """The objects in contact with geoms of the robot."""
-        pairs = self._simulator.data.contact.geom
+        pairs = self._data.contact.geom
         pairs = pairs[part[pairs].any(axis=1)]
         return sorted({*self._roles[pairs].ravel()} - {ROBOT, REST})
 
     def truth(self, masks: bool = False) -> Truth:
         with self._timed("truth"):
-            data = self._simulator.data
+            data = self._data
             seen: dict[str, dict[str, Mask]] = {}
             hand: dict[str, Mask] = {}
             for camera in self.camera_names if masks else ():
@@ -491,13 +477,13 @@ class LiberoEnv:
                 contacts=contact_partners(self._roles[data.contact.geom]),
                 masks=seen,
                 hand=hand,
-                succeeded=bool(self._simulator.env._check_success()),
+                succeeded=bool(self._libero._check_success()),
             )
 
     def _masks(self, camera: str) -> tuple[dict[str, Mask], Mask]:
-        renderer = self.world.renderer(self._simulator.model, self.image_size)
+        renderer = self.world.renderer(self._model, self.image_size)
         renderer.enable_segmentation_rendering()
-        renderer.update_scene(self._simulator.data, camera, _SHOWN)
+        renderer.update_scene(self._data, camera, _SHOWN)
         drawn = renderer.render()
         renderer.disable_segmentation_rendering()
         is_geom = drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM)
@@ -509,7 +495,7 @@ class LiberoEnv:
         found = []
         for name in self.camera_names:
             size = (self.image_size, self.image_size)
-            camera = optics.camera(self._simulator.model, self._simulator.data, name, size)
+            camera = optics.camera(self._model, self._data, name, size)
             camera.pose_world[:3, 3] -= self.world.origin_m
             found.append(camera)
         return tuple(found)
