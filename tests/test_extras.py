@@ -94,7 +94,7 @@ def test_a_study_with_a_trained_policy_names_the_extra(monkeypatch: pytest.Monke
 def test_an_import_that_fails_is_one_line(
     monkeypatch: pytest.MonkeyPatch, module: str, extra: str
 ) -> None:
-    def fail() -> None:
+    def fail(**_: object) -> None:
         raise ModuleNotFoundError(f"No module named {module!r}", name=module)
 
     monkeypatch.setattr(cli, "app", fail)
@@ -108,7 +108,7 @@ def test_another_import_that_fails_is_not_explained_away(monkeypatch: pytest.Mon
     error = ModuleNotFoundError("No module named 'yours'", name="yours")
     assert missing_part(error) is None
 
-    def fail() -> None:
+    def fail(**_: object) -> None:
         raise error
 
     monkeypatch.setattr(cli, "app", fail)
