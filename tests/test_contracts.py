@@ -306,27 +306,16 @@ def test_a_policy_that_reuses_its_array_keeps_the_contract() -> None:
 
 # --- The page ------------------------------------------------------------------------------------
 
-PAGE = (ROOT / "docs" / "contracts.md").read_text()
-
-
-def test_the_page_names_every_test_of_every_contract() -> None:
-    named = {}
-    for section in PAGE.split("\n## ")[1:]:
-        named[section.split()[0].lower()] = set(re.findall(r"`(test_\w+)`", section))
-    held = {}
-    for path in sorted(Path(given.__file__).parent.glob("test_*.py")):
-        held[path.stem.removeprefix("test_")] = set(
-            re.findall(r"^def (test_\w+)", path.read_text(), re.M)
-        )
-    assert named == held
-
-
-EXAMPLES = "\n\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
-COMMANDS = [shlex.split(line) for line in re.findall(r"^pytest .*$", PAGE, re.M) if "mine:" in line]
+BEFORE, PAGE = (ROOT / "docs" / "extend.md").read_text().split("\n## Contracts\n")
+PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
+(POLICY,) = (block for block in PYTHON.findall(BEFORE) if "class Still" in block)
+(DESK,) = (block for block in PYTHON.findall(BEFORE) if "SUITE = Suite(" in block)
+EXAMPLES = "\n\n".join([*PYTHON.findall(PAGE), POLICY.partition("\nstudy =")[0]])
+COMMANDS = [shlex.split(line) for line in re.findall(r"^pytest .*$", PAGE, re.M)]
 
 
 def test_every_protocol_has_a_section_with_its_command() -> None:
-    sections = {section.split()[0].lower() for section in PAGE.split("\n## ")[1:]}
+    sections = {section.split()[0].lower() for section in PAGE.split("\n### ")[1:]}
     assert sections == set(PROTOCOLS)
     assert sorted(command[3] for command in COMMANDS) == sorted(f"--{name}" for name in PROTOCOLS)
 
@@ -335,9 +324,11 @@ def test_every_protocol_has_a_section_with_its_command() -> None:
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The page's examples, saved as it says."""
     (tmp_path / "mine.py").write_text(EXAMPLES)
+    (tmp_path / "desk.py").write_text(DESK)
     monkeypatch.chdir(tmp_path)
     yield tmp_path
-    sys.modules.pop("mine", None)
+    for module in ("mine", "desk"):
+        sys.modules.pop(module, None)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=[command[3] for command in COMMANDS])

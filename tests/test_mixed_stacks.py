@@ -236,7 +236,7 @@ def test_an_option_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_the_page_says_of_every_option_what_it_needs() -> None:
     rows: dict[tuple[str, str], str] = {}
     role = ""
-    for line in (ROOT / "docs" / "stacks.md").read_text().splitlines():
+    for line in (ROOT / "docs" / "perception.md").read_text().splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 4 and cells[1].startswith("`"):
             role = cells[0].partition(",")[0] or role

@@ -166,7 +166,7 @@ def test_the_published_table_is_of_these_paraphrases(every: dict[str, list[Parap
 
 
 def test_the_page_quotes_the_published_table() -> None:
-    page = (ROOT / "docs" / "instructions.md").read_text()
+    page = (ROOT / "docs" / "photos.md").read_text()
     table: pd.DataFrame = pq.read_table(PUBLISHED).to_pandas()
     held_out = table[table["part"] == "test"]
     rows = [
@@ -176,6 +176,7 @@ def test_the_page_quotes_the_published_table() -> None:
     ]
     shown = {(row[0], row[1]): row[2:] for row in rows if len(row) == 7}
     found = parsers.accuracy(held_out)
+    found = found[(found.parser == "embedding") | (found.kind == "all")]
     assert len(shown) == len(found)
     for line in found.to_dict("records"):
         families, n, right, silent, wrong = shown[line["parser"], line["kind"]]

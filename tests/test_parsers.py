@@ -276,7 +276,7 @@ def test_the_page_says_how_many_uses_each_parser_reads() -> None:
     about = json.loads(server.asked[0][2]["messages"][1]["content"])
     sent = about["earlier uses, last one last"]
     assert [use["at"] for use in sent] == [use.at for use in uses[-len(sent) :]]
-    page = Path(__file__).resolve().parents[1] / "docs" / "instructions.md"
+    page = Path(__file__).resolve().parents[1] / "docs" / "photos.md"
     words = " ".join(page.read_text().split())
     assert (
         f"`embedding` reads the last {MAX_USES} uses, and `chat` sends the last {len(sent)}"

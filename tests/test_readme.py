@@ -13,7 +13,7 @@ from vap_core.study.results import load_runs, results
 from vap_core.study.stats import ALL_TASKS, Estimate
 from vap_core.study.trials import shipped
 
-LIMITS = {"README.md": 1100, "CHANGELOG.md": 1500, "docs": 12_000}
+LIMITS = {"README.md": 800, "CHANGELOG.md": 1500, "docs": 10_000}
 """Words at most."""
 RETIRED = (
     "first_policy_ablations", "by_recipe", "more_scenes", "more_steps", "horizon.parquet",

@@ -113,5 +113,5 @@ def test_the_pages_say_which_rooms_the_heads_of_perception_know() -> None:
     drawn = [draw_style(np.random.default_rng(i)) for i in range(500)]
     known = np.mean([style.planks == DEFAULT_STYLE.planks for style in drawn])
     assert known == pytest.approx(0.4, abs=0.05)
-    for page in (DATA.parent / "docs" / "stacks.md", DATA / "weights" / "README.md"):
+    for page in (DATA.parent / "docs" / "perception.md", DATA / "weights" / "README.md"):
         assert "two in five of the" in " ".join(page.read_text().lower().split())

@@ -424,6 +424,26 @@ def run_episode(
     return episode
 
 
+def animate(films: Mapping[str, Sequence[Rgb]], path: Path, side_px: int = 320) -> None:
+    """Films side by side as a GIF of eight pictures a second, each below its caption.
+
+    A film that ends earlier stays at its last picture.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.load_default(size=17)
+    pages = []
+    for i in range(max(map(len, films.values()))):
+        page = Image.new("RGB", (len(films) * (side_px + 8) - 8, side_px + 28), "white")
+        for at, (caption, pictures) in enumerate(films.items()):
+            shown = Image.fromarray(pictures[min(i, len(pictures) - 1)])
+            page.paste(shown.resize((side_px, side_px)), (at * (side_px + 8), 28))
+            ImageDraw.Draw(page).text((at * (side_px + 8) + 2, 4), caption, "black", font)
+        pages.append(page.quantize(method=Image.Quantize.MAXCOVERAGE))
+    durations = [125] * (len(pages) - 1) + [2000]
+    pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
+
+
 def first_success(episodes: "pd.DataFrame", suite: str, policy: str) -> tuple[str, int]:
     """Task and number of VAP's first success in a list, in the list's order.
 

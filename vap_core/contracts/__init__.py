@@ -2,5 +2,5 @@
 
     pytest --pyargs vap_core.contracts --detector my.module:Detector
 
-docs/contracts.md has the protocols, and what is tested of each.
+docs/extend.md has the protocols, and what is tested of each.
 """

@@ -448,7 +448,7 @@ def load_map(name: str) -> WireMap:
         where = ".".join(map(str, fault["loc"]))
         raise BadPolicy(
             f"wire map: {name}: {where}: {first_line(fault['msg']):.200}; see the maps that ship: "
-            "docs/served.md."
+            "docs/policies.md."
         ) from error
     except OSError as error:
         raise BadPolicy(f"wire map: {name} cannot be read ({error.strerror}).") from error
