@@ -20,6 +20,7 @@ from vap_make.films.demonstrations import (
     Film,
     after_a_miss,
     cached,
+    draw_models,
     draw_objects,
     row,
     stage_file,
@@ -165,9 +166,9 @@ def test_the_category_that_is_held_out_is_no_distractor(monkeypatch: pytest.Monk
     held_out = replace(RECIPES[known.name], held_out_category="straw cup")
 
     def drawn() -> set[str]:
-        rng = np.random.default_rng(0)
-        names = [draw_objects(known, filmed_tasks(known.name)[0], rng) for _ in range(60)]
-        return {objects.get_object(name).category for name in itertools.chain(*names)}
+        rng, task = np.random.default_rng(0), filmed_tasks(known.name)[0]
+        models = [draw_models(known, task, rng, held_out=False) for _ in range(60)]
+        return {model.category for model in itertools.chain(*models)}
 
     assert "straw cup" in drawn()
     monkeypatch.setitem(RECIPES, known.name, held_out)
