@@ -10,13 +10,15 @@ from jaxtyping import Bool, Float64, Int64
 
 from vap_core.base.errors import BadRobot, UnknownName
 from vap_core.base.types import Camera, Mask, Rgb, value
-from vap_core.simulation.gl import ensure_gl
+from vap_core.simulation.gl import ensure_gl, keep_contexts
 
 ensure_gl()
 import mujoco  # noqa: E402
 
 from vap_core.simulation.looks import PLAIN_LIGHT, Light, dim  # noqa: E402
 from vap_core.simulation.occluder import Screen, draw_screens  # noqa: E402
+
+keep_contexts()
 
 HIDDEN_GROUP = 5
 """Geom group that is never drawn."""

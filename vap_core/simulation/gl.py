@@ -10,6 +10,7 @@ import resource
 import subprocess
 import sys
 from functools import cache
+from threading import local
 
 from vap_core.base.errors import MissingGL
 
@@ -96,6 +97,30 @@ def ensure_gl() -> str:
         f"ensure_gl: {what} {'cannot' if chosen else 'can'} draw without a display ({said}). "
         f"Mend what is named there;{limit}{unset}{device} run: {REMEDY}"
     )
+
+
+def keep_contexts() -> None:
+    """From now on a renderer takes the OpenGL context that another has left, in the same thread.
+
+    To make one and to compile its shaders takes as long as six pictures. Call it before a renderer
+    is made.
+    """
+    from mujoco.rendering.classic import gl_context
+
+    spare = local()
+
+    class Kept(gl_context.GLContext):  # type: ignore[misc,valid-type]
+        def free(self) -> None:
+            spare.__dict__.setdefault("contexts", []).append(self)
+
+        def __del__(self) -> None:
+            """It may be freed after its renderer alone."""
+
+    def take(width: int, height: int) -> Kept:
+        left = spare.__dict__.get("contexts")
+        return left.pop() if left else Kept(width, height)
+
+    gl_context.GLContext = take
 
 
 if __name__ == "__main__":

@@ -92,9 +92,6 @@ class Stage:
         model.light("lamp").diffuse = shot.bright
         mujoco.mj_kinematics(model, self._data)
         mujoco.mj_camlight(model, self._data)
-        self._renderer.update_scene(self._data, self._camera(name, shot))
-
-    def _camera(self, name: str, shot: Shot) -> mujoco.MjvCamera:
         x, y, z = extent_m(self.models[name])
         extent = max(z, float(np.hypot(x, y)))
         camera = mujoco.MjvCamera()
@@ -102,7 +99,7 @@ class Stage:
         camera.azimuth = 90 + np.degrees(shot.azimuth)
         camera.elevation = -np.degrees(shot.elevation)
         camera.distance = 0.5 * extent / (shot.fill * np.tan(np.radians(FOVY_DEG / 2)))
-        return camera
+        self._renderer.update_scene(self._data, camera)
 
 
 def photograph(model: ObjectModel, shots: Sequence[Shot], size: int = 320) -> list[Rgb]:
