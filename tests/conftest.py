@@ -5,6 +5,7 @@ import os
 import tarfile
 from collections.abc import Generator
 from dataclasses import replace
+from multiprocessing import forkserver
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -22,6 +23,14 @@ check_signatures("vap_core", "vap_make")
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
     "0"  # read when ray is first imported: the tests' cluster stays on loopback
 )
+
+forkserver.set_forkserver_preload(
+    ["vap_core.study.server", "vap_core.study.engine", "vap_core.recording.recorder",
+     "vap_core.policies.lerobot.adapter", "lerobot.policies",
+     "vap_core.policies.mini_pi0.processor_mini_pi0", "vap_core.study.server_ready"]
+)  # fmt: skip
+forkserver.set_forkserver_preload = lambda modules: None
+"""One server serves a whole session of tests: what any command's workers import, it imports once."""
 
 END_TO_END = {
     "test_attention", "test_benchmarks", "test_cli", "test_cluster", "test_dataset",

@@ -115,16 +115,15 @@ def test_vla_evals_connection_against_our_server(vla_eval: Path, tmp_path: Path)
 
 @pytest.mark.timeout(240)
 def test_vla_eval_counts_what_our_engine_counts(vla_eval: Path, tmp_path: Path) -> None:
-    """Four episodes of simpler-bridge with mini-pi0, by its runner and by ours."""
+    """Two episodes of simpler-bridge with mini-pi0, of which it fails one, by its runner and by ours."""
     from vap_core.rollout import rollout
 
-    tasks = ("put-owl-figurine", "put-straw-cup")
-    wanted = []
-    for task in tasks:
-        study = Study((("simpler-bridge", task),), ("generic",), policy="mini-pi0")
-        rows = study.rows("simpler-bridge", task)[:2]
-        trial = make_trial(study, rows, "generic", tmp_path / "memory")
-        wanted.append(sum(episode.outcome.success for episode in rollout(trial, rows)))
+    suite, task = "simpler-bridge", "put-owl-figurine"
+    study = Study(((suite, task),), ("generic",), policy="mini-pi0")
+    rows = study.rows(suite, task)[:2]
+    trial = make_trial(study, rows, "generic", tmp_path / "memory")
+    wanted = sum(episode.outcome.success for episode in rollout(trial, rows))
+    assert wanted == 1
     config = {
         "server": {"url": "ws://127.0.0.1:0"},
         "output_dir": str(tmp_path / "out"),
@@ -132,7 +131,7 @@ def test_vla_eval_counts_what_our_engine_counts(vla_eval: Path, tmp_path: Path) 
             {
                 "benchmark": "vla_eval_vap:VapBenchmark",
                 "episodes_per_task": 2,
-                "params": {"suite": "simpler-bridge", "tasks": list(tasks)},
+                "params": {"suite": suite, "tasks": [task]},
             }
         ],
     }
@@ -145,5 +144,4 @@ def test_vla_eval_counts_what_our_engine_counts(vla_eval: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr[-2000:]
     (file,) = (tmp_path / "out").glob("*aggregate.json")
     found = json.loads(file.read_text())
-    counts = [round(2 * task["mean_success"]) for task in found["tasks"]]
-    assert counts == wanted
+    assert [round(2 * task["mean_success"]) for task in found["tasks"]] == [wanted]
