@@ -109,7 +109,7 @@ def keep_contexts() -> None:
 
     spare = local()
 
-    class Kept(gl_context.GLContext):  # type: ignore[misc,valid-type]
+    class Kept(gl_context.GLContext):
         def free(self) -> None:
             spare.__dict__.setdefault("contexts", []).append(self)
 
