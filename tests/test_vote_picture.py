@@ -22,15 +22,15 @@ RGB, _ = draw(CAMERA, 0)
 CELL = 40
 
 
-def picture(right: bool | None = None, photos: int = K, winner: int | None = 0) -> np.ndarray:
+def picture(yours: int | None = None, photos: int = K, winner: int | None = 0) -> np.ndarray:
     grounding = replace(ground(CAMERA), winner=winner)
     references = [np.full((9, 12, 3), 200, np.uint8)] * photos
-    return vote_picture(grounding, RGB, references, right=right, cell_px=CELL)
+    return vote_picture(grounding, RGB, references, yours=yours, cell_px=CELL)
 
 
 def test_a_row_for_each_candidate_a_column_for_each_photo() -> None:
     drawn = picture()
-    assert drawn.shape == (18 + CELL + 3 * CELL + 20, CELL + K * CELL + 92, 3)
+    assert drawn.shape == (18 + CELL + 3 * CELL + CELL, CELL + K * CELL + 92, 3)
     framed = (drawn == rgb8(TARGET)).all(axis=2)
     assert framed[18 : 18 + CELL].any(axis=0).sum() == K * (CELL - 8), "a frame around each photo"
     assert not framed[18 + CELL :].any(), "orange is the target's photos alone"
@@ -58,13 +58,15 @@ def test_every_photo_votes_once_in_the_row_that_the_vote_counted(
 
 
 def test_the_elected_row_is_white_and_says_whether_it_is_right() -> None:
-    unknown, right, wrong = picture(), picture(right=True), picture(right=False)
+    unknown, right, wrong = picture(), picture(yours=0), picture(yours=2)
     row = slice(18 + CELL, 18 + 2 * CELL)
     for drawn in (unknown, right, wrong):
         assert (drawn[row, 2] == 255).all(axis=1).mean() > 0.8
     assert (unknown != right).any()
     assert (right != wrong).any()
     assert (unknown[row.stop :] == right[row.stop :]).all(), "nothing else changes"
+    orange = (wrong == rgb8(TARGET)).all(axis=2)
+    assert orange[row.stop :].any(), "the row that would have been right is marked"
     assert not (picture(winner=None)[row, 2] == 255).all(axis=1).any(), "nothing is elected"
 
 

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from tests.drawn import ROW, SIDE, SIZES, SUCCESS, K, columns, entities, frame, opening, rerun
+from tests.drawn import ROW, SIDE, SUCCESS, K, columns, entities, frame, opening, rerun
+from vap_core.base.pictures import object_labels
 from vap_core.base.types import Track
 from vap_core.recording import Recorder, read_summary
 from vap_core.recording.entities.curves import LINE_CHARACTERS
+from vap_core.recording.entities.pictures import OTHER_CLASS, YOURS_CLASS
+from vap_core.recording.texts import verdict_line
 from vap_core.rollout.types import MaskCoverage
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study.diagnosis import explain
@@ -109,11 +112,13 @@ def test_a_recording_says_why_and_its_blueprint_opens_there(
     assert f"{case}: {sub_case}" in told
     assert max(map(len, told)) <= LINE_CHARACTERS, "the list shows 60 characters of a row"
     (verdict,) = columns(path, "/vap/verdict", "TextDocument:text").values()
-    heading, _, sentence = str(verdict[0]).partition("\n\n")  # type: ignore[index]
-    assert heading.startswith(f"## FAILURE · {case.capitalize()} · ")
-    assert sentence.startswith(summary["case_sentence"])
+    heading, _, about = str(verdict[0]).partition("\n\n")  # type: ignore[index]
+    assert heading.startswith("### FAILURE · ")
+    assert f"({case.capitalize()}): " in heading
+    assert "owl_a" not in heading, "the target is called yours"
+    assert f"decided at step {frame_index} · vap" in about
+    assert {f"{case}: {sub_case}", "everything"} <= tabs(path)
     assert rerun("rrd", "verify", path).returncode == 0
-    assert f"{case}: {sub_case}" in tabs(path)
 
 
 def test_a_target_that_is_left_out_has_no_distance_from_the_gripper(tmp_path: Path) -> None:
@@ -127,15 +132,25 @@ def test_a_target_that_is_left_out_has_no_distance_from_the_gripper(tmp_path: Pa
     assert columns(path, "/vap/hand/deciding_frame", "Scalars:scalars") == {0: nearest[0]}
 
 
-def test_a_prompt_wears_the_colour_of_what_it_covers(tmp_path: Path) -> None:
+def test_objects_keep_their_pixels_and_wear_an_outline_with_a_name(tmp_path: Path) -> None:
     fail(tmp_path / "one.rrd", "owl_b")
-    buffer = columns(
-        tmp_path / "one.rrd", "/observation.images.front/identity", "SegmentationImage:buffer"
-    )[3]
+    entity = "/observation.images.front/identity"
+    buffer = columns(tmp_path / "one.rrd", entity, "SegmentationImage:buffer")[3]
     image = np.frombuffer(bytes(buffer[0]), np.uint8).reshape(SIDE, SIDE)  # type: ignore[index]
     masks = frame(3, opening(1)).truth.masks["front"]
-    i = list(SIZES).index("owl_b")
-    assert set(np.unique(image[masks["owl_b"]])) == {10 + 2 * i, 11 + 2 * i}
-    assert set(np.unique(image[masks["owl_a"]])) == {0, 10 + 2 * list(SIZES).index("owl_a") + 1}, (
-        "a rim alone"
-    )
+    assert set(np.unique(image)) == {0, OTHER_CLASS, YOURS_CLASS}
+    assert not any(image[mask].any() for mask in masks.values())
+    names = columns(tmp_path / "one.rrd", f"{entity}/labels", "Points2D:labels")[3]
+    assert set(names) == {"yours", "owl_b", "owl_c"}  # type: ignore[call-overload]
+
+
+def test_every_object_is_called_what_it_is_to_the_user() -> None:
+    names = ["cup-personal", "cup-lookalike-3", "mug-lookalike-1", "coke-can-prop"]
+    said = object_labels(names, "cup-personal")
+    assert list(said.values()) == ["yours", "look-alike 3", "mug lookalike 1", "coke can"]
+
+
+def test_a_success_says_who_what_and_how_it_ended() -> None:
+    line = verdict_line(opening(1), SUCCESS, None)
+    rewritten = opening(1).rewritten
+    assert line == f'SUCCESS · picked your owl in {SUCCESS.steps} steps · "{rewritten}"'

@@ -107,6 +107,18 @@ def object_colours(names: Sequence[str], target: str, goal: str | None = None) -
     return colours
 
 
+def object_labels(names: Sequence[str], target: str) -> dict[str, str]:
+    """What every object of a scene is called where a user reads: "yours", "look-alike 3"."""
+    labels = {}
+    for name in names:
+        kind, _, number = name.rpartition("-lookalike-")
+        words = f"look-alike {number}"
+        if not kind or not target.startswith(kind):
+            words = name.removesuffix("-prop").replace("-", " ")
+        labels[name] = "yours" if name == target else words
+    return labels
+
+
 def rgb8(hex_colour: str) -> Rgb8:
     """The three numbers of "#rrggbb"."""
     digits = hex_colour.removeprefix("#")
@@ -177,30 +189,34 @@ def vote_picture(
     rgb: Rgb,
     references: Sequence[Rgb],
     *,
-    right: bool | None = None,
+    yours: int | None = None,
     cell_px: int = 88,
     dark: bool = True,
 ) -> Rgb:
     """The vote of one target in one view, over the picture `rgb` that it was held on.
 
     `references` are the remembered crops, in the order of the columns; without them a column has
-    its number alone. `right` says whether the elected candidate is the target, where that is known.
+    its number alone. `yours` is the candidate that is the target, whose row is orange; -1 where
+    none is, None where that is unknown.
     """
     from PIL import Image, ImageDraw
 
     rows = shown_candidates(grounding)
+    if yours is not None and yours >= 0 and yours not in rows:
+        rows[-1] = yours
     n_photos = grounding.similarity.shape[1]
     left, beside = cell_px, round(2.3 * cell_px)
     top = round(0.45 * cell_px)
     header = cell_px if references else round(0.4 * cell_px)
     width = left + n_photos * cell_px + beside
-    height = top + header + max(len(rows), 1) * cell_px + round(0.5 * cell_px)
+    height = top + header + max(len(rows), 1) * cell_px + cell_px
     paper, ink, line = PAPERS[dark]
     picture = Image.new("RGB", (width, height), paper)
     draw = ImageDraw.Draw(picture)
     font = _font(round(FONT_SHARE * cell_px))
     bold = _font(round(1.15 * FONT_SHARE * cell_px))
-    title = f"{grounding.camera}: which {grounding.candidates.phrase} is {grounding.object}?"
+    whose = grounding.object if yours is None else "yours"
+    title = f"{grounding.camera}: which {grounding.candidates.phrase} is {whose}?"
     draw.text((6, top / 2), title, fill=ink, font=bold, anchor="lm")
 
     y = top
@@ -234,15 +250,26 @@ def vote_picture(
         beside_cells = (left + n_photos * cell_px + 8, y)
         texts += _row_words(grounding, i, beside_cells, cell_px, rgb8(ink))
         if i == grounding.winner:
+            right = None if yours is None else i == yours
             _elected(draw, (0, y), (width - 3, cell_px), right)
         else:
             draw.line((0, y + cell_px, width, y + cell_px), fill=line)
+        if i == yours:
+            draw.rectangle((4, y + 4, width - 8, y + cell_px - 4), outline=TARGET, width=3)
+            place = (beside_cells[0] + 0.4 * cell_px, y + 0.25 * cell_px)
+            draw.text(place, "yours", fill=TARGET, font=bold, anchor="lm")
         y += cell_px
     if not rows:
         text = f"no {grounding.candidates.phrase} found"
         draw.text((width / 2, y + cell_px / 2), text, fill=ink, font=bold, anchor="mm")
         y += cell_px
-    draw.text((6, y + cell_px / 4), result_line(grounding), fill=ink, font=bold, anchor="lm")
+    words = result_line(grounding)
+    if yours == -1 and rows:
+        words += "; yours is none of them"
+    draw.text((6, y + cell_px / 4), words, fill=ink, font=bold, anchor="lm")
+    _dot(draw, (0, y + 0.55 * cell_px), cell_px)
+    key = "the vote of a photo: the row most like it (cosines, bright: alike)"
+    draw.text((cell_px, y + 0.75 * cell_px), key, fill=ink, font=font, anchor="lm")
     drawn = np.array(picture)
     _write(drawn, texts, cell_px)
     return drawn

@@ -117,7 +117,7 @@ class ClipRecorder:
         at = time_columns([(frame_index, timestamp_s)])
         log_vote(self._rec, grounding, 0, encode_jpeg(image, JPEG_QUALITY), at)
         log_vote_picture(
-            self._rec, grounding, 0, rgb=image, references=obj.crops, right=None, at=at
+            self._rec, grounding, 0, rgb=image, references=obj.crops, yours=None, at=at
         )
         document = grounding_document(grounding, obj, instruction, rewritten)
         log_row(self._rec, "/vap/instruction", document, at=at)
@@ -198,7 +198,7 @@ class DatasetRecorder:
             grounding = attended.groundings[camera][0]
             log_vote(self._rec, grounding, 0, encode_jpeg(rgb, JPEG_QUALITY), at)
             log_vote_picture(
-                self._rec, grounding, 0, rgb=rgb, references=obj.crops, right=None, at=at
+                self._rec, grounding, 0, rgb=rgb, references=obj.crops, yours=None, at=at
             )
             if i == 0:
                 document = grounding_document(grounding, obj, told, attended.text)

@@ -10,6 +10,7 @@ from vap_core.base.pictures import Rgb8, rgb8
 
 TARGET = rgb8(pictures.TARGET)
 ELECTED = rgb8(pictures.ELECTED)
+GOAL = rgb8(pictures.on_dark(pictures.GOAL))
 LOOKALIKES = tuple(rgb8(colour) for colour in pictures.LOOKALIKES)
 CAMERAS = tuple(rgb8(colour) for colour in pictures.CAMERAS)
 MUTED = rgb8(pictures.FRAME)

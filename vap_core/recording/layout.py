@@ -47,6 +47,11 @@ def policy_view(camera: str) -> Part:
     return _image_view(camera, "policy input", ["/prompted"])
 
 
+def named_view(camera: str) -> Part:
+    """The same with the outlines and the names of the objects over it."""
+    return _image_view(camera, "what the policy sees", ["/prompted", "/identity/**"])
+
+
 def track_view(camera: str, title: str) -> Part:
     """The raw picture with the tracked mask, white, and the true one, orange."""
     return _image_view(camera, title, ["", "/mask/**"])
@@ -55,11 +60,6 @@ def track_view(camera: str, title: str) -> Part:
 def vote_view(camera: str, title: str = "vote at t = 0", j: int = 0) -> Part:
     """The candidates of target j over the picture that the vote was held on."""
     return _image_view(camera, title, [f"/candidates{target_suffix(j)}/**"])
-
-
-def coverage_view(camera: str) -> Part:
-    """The prompt in the colour of the object that it covers."""
-    return _image_view(camera, "what the prompt covers", ["", "/identity"])
 
 
 def attention_view(camera: str, query: str) -> Part:
@@ -115,36 +115,14 @@ def events_view() -> Part:
     return rrb.TextLogView(origin="/vap/events", name="events", columns=columns)
 
 
-def robot_curve_views(header: EpisodeHeader, axes: Axes) -> list[Part]:
-    """Arm action, gripper action, and robot state."""
-    n_arm = len(header.action_names) - 1
-    return [
-        _curve_view("/action", "action", axes, visible=[True] * n_arm + [False]),
-        _curve_view("/action", "gripper", axes, visible=[False] * n_arm + [True]),
-        _curve_view("/observation.state", "state", axes),
-    ]
-
-
-def method_curve_views(header: EpisodeHeader, axes: Axes) -> list[Part]:
-    """Track scores and vote margins, where the method has some."""
-    cameras = [camera for camera, groundings in header.groundings.items() if groundings]
-    if not cameras:
-        return []
-    return [
-        track_score_view(axes),
-        _curve_view("/vap/vote_margin", "vote margin", axes, UNIT_RANGE),
-    ]
-
-
 def track_score_view(axes: Axes = DEFAULT_AXES) -> Part:
     """How sure the tracker is of the target, in every view."""
-    return _curve_view("/vap/track_score", "track score", axes, UNIT_RANGE)
+    return _curve_view("/vap/track_score", "score", axes, UNIT_RANGE)
 
 
 def gripper_view(axes: Axes = DEFAULT_AXES) -> Part:
     """The gripper's distance from the target and the nearest other object, and what it holds."""
-    title = "gripper to target (orange), to nearest other (blue), cm"
-    return _curve_view("/vap/hand", title, axes, axes.gripper_cm, legend=False)
+    return _curve_view("/vap/hand", "distance to yours, cm", axes, axes.gripper_cm)
 
 
 def _image_view(camera: str, title: str, suffixes: Sequence[str]) -> rrb.Spatial2DView:
@@ -163,13 +141,11 @@ def _curve_view(
     axes: Axes,
     limits: tuple[float, float] | None = None,
     visible: Sequence[bool] | None = None,
-    *,
-    legend: bool = True,
 ) -> rrb.TimeSeriesView:
     """Curves over the control steps; a legend stands to the right of their end."""
     axis = None
     time = None
-    if legend and axes.steps is not None:
+    if axes.steps is not None:
         last = round((1 + LEGEND_SHARE) * axes.steps)
         time = rrb.TimeAxis(
             view_range=rr.TimeRange(
@@ -177,10 +153,8 @@ def _curve_view(
                 end=rr.TimeRangeBoundary.absolute(seq=last),
             )
         )
-    corner = rrb.Corner2D.RightTop
     if limits is not None:
         axis = rrb.ScalarAxis(range=limits)
-        corner = rrb.Corner2D.RightBottom
     overrides: Any = None
     if visible is not None:
         overrides = {origin: rr.SeriesLines(visible_series=list(visible))}
@@ -190,7 +164,7 @@ def _curve_view(
         contents=["$origin/**"],
         axis_x=time,
         axis_y=axis,
-        plot_legend=rrb.PlotLegend(corner, visible=legend),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
         overrides=overrides,
     )
 
@@ -213,12 +187,10 @@ def _viewpoint(header: EpisodeHeader) -> rrb.EyeControls3D:
     )
 
 
-VERDICT_SHARES = [0.11, 0.89]
+VERDICT_SHARES = [0.145, 0.855]
 """Height of the verdict, and of everything below it."""
-EVIDENCE_SHARES = [0.71, 0.29]
+EVIDENCE_SHARES = [0.58, 0.42]
 """Height of the evidence, and of the time course below it."""
-EVENTS_SHARE = 1.7
-"""Width of the events, where the instruction has 1."""
 
 
 def episode_blueprint(
@@ -228,20 +200,16 @@ def episode_blueprint(
     queries: Sequence[str] = (),
     axes: Axes = DEFAULT_AXES,
 ) -> StoredBlueprint:
-    """The verdict; below it everything, before it the evidence of a diagnosed failure, last the
-    policy's attention.
+    """The verdict; below it what the policy saw, the vote and the distance, then a tab with
+    everything, last the policy's attention.
 
     `queries` are those whose attention is recorded; each has a tab of its own. `axes` are those of
     the charts.
     """
-    tabs: list[Part] = [_overview(header, axes)]
+    tabs = [_first_tab(header, diagnosis, axes), _overview(header, axes)]
     if queries:
         tabs.append(_attention_tab(header, queries, axes))
-    if diagnosis is not None and header.cameras:
-        tabs.insert(0, _evidence_tab(header, diagnosis, axes))
-    body = tabs[0]
-    if len(tabs) > 1:
-        body = rrb.Tabs(*tabs, active_tab=0)
+    body = rrb.Tabs(*tabs, active_tab=0)
     window = rrb.Vertical(verdict_view(), body, row_shares=VERDICT_SHARES)
     return full_window(window, header.hz)
 
@@ -268,18 +236,18 @@ def full_window(root: Part, fps: float = 1.0) -> StoredBlueprint:
 
 
 def _overview(header: EpisodeHeader, axes: Axes) -> rrb.Container:
-    """Pictures, scene and votes above; text, curves and events below."""
-    pictures, share = _camera_grid(header)
-    right: Part = scene_view(header)
-    votes = [vote_picture_view(camera) for camera in _voting(header)]
-    if votes:
-        right = rrb.Vertical(right, rrb.Tabs(*votes, active_tab=0), row_shares=[1, 1.1])
-    top = rrb.Horizontal(pictures, right, column_shares=[share, 1 - share])
+    """Every view's pictures and the scene above; text, curves and events below."""
+    tabs: list[Part] = []
+    for camera in header.cameras:
+        pictures = [policy_view(camera.name), track_view(camera.name, "track, truth")]
+        for j, grounding in enumerate(header.groundings.get(camera.name, ())):
+            title = f"vote, {grounding.object}" if j else "vote at t = 0"
+            pictures.append(vote_view(camera.name, title, j))
+        tabs.append(rrb.Grid(*pictures, grid_columns=min(3, len(pictures)), name=camera.name))
+    parts = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
+    top = rrb.Horizontal(*parts, scene_view(header), column_shares=[1.6, 1.0][-1 - len(parts) :])
     return rrb.Vertical(
-        top,
-        _time_course(header, axes),
-        row_shares=EVIDENCE_SHARES,
-        name="everything",
+        top, _time_course(header, axes), row_shares=EVIDENCE_SHARES, name="everything"
     )
 
 
@@ -297,110 +265,51 @@ def _attention_tab(header: EpisodeHeader, queries: Sequence[str], axes: Axes) ->
     )
 
 
-def _evidence_tab(header: EpisodeHeader, diagnosis: Diagnosis, axes: Axes) -> rrb.Container:
-    """The evidence that decided the case of a failure."""
-    camera = diagnosis.camera or header.cameras[0].name
-    with_gripper = True
-    match diagnosis.case:
-        case "case 1" | "unlabelled":
-            evidence = _vote_evidence(header, camera, diagnosis.sub_case == "drift")
-        case "case 2":
-            evidence = _views_evidence(header)
-        case _:
-            evidence = _manipulation_evidence(header, axes)
-            with_gripper = False  # its curves are in the evidence
-    return rrb.Vertical(
-        evidence,
-        _time_course(header, axes, with_gripper=with_gripper),
-        row_shares=EVIDENCE_SHARES,
-        name=f"{diagnosis.case}: {diagnosis.sub_case}",
-    )
+def _first_tab(header: EpisodeHeader, diagnosis: Diagnosis | None, axes: Axes) -> rrb.Container:
+    """What the policy saw in every view, the vote, and the distance to the target.
 
-
-def _vote_evidence(header: EpisodeHeader, camera: str, drifted: bool) -> Part:
-    """Case 1: what was compared and what won; after a drift, what the prompt covers now."""
-    large, small = vote_view(camera), coverage_view(camera)
-    if drifted:
-        large, small = small, large
-    parts = [large, rrb.Vertical(small, policy_view(camera))]
-    shares = [1.25, 0.68]
-    if camera in _voting(header):
-        parts.append(vote_picture_view(camera))
-        shares.append(1.3)
-    return rrb.Horizontal(*parts, column_shares=shares)
-
-
-def _views_evidence(header: EpisodeHeader) -> Part:
-    """Case 2: every view's prompt in the colour of the object it covers, side by side."""
-    columns = []
-    for camera in header.cameras:
-        pictures = rrb.Horizontal(vote_view(camera.name, "vote"), policy_view(camera.name))
-        columns.append(rrb.Vertical(coverage_view(camera.name), pictures, row_shares=[1.9, 1]))
-    return rrb.Horizontal(*columns)
-
-
-def _manipulation_evidence(header: EpisodeHeader, axes: Axes) -> Part:
-    """Case 3: every view's prompt is right, the scene, and the gripper's distances.
-
-    A method that prompts nothing shows the target's outline instead.
+    The votes are tabs, before all that of the deciding view. What decided a failure has most room.
     """
-    rows = []
-    for camera in header.cameras:
-        shown = track_view(camera.name, "target outlined")
-        if _voting(header):
-            shown = coverage_view(camera.name)
-        rows.append(rrb.Horizontal(shown, policy_view(camera.name)))
-    pictures: Part = rrb.Vertical(*rows)
-    share = 0.95
-    if len(rows) == 1:
-        pictures = rrb.Vertical(shown, policy_view(header.cameras[0].name))
-        share = 0.7
-    return rrb.Horizontal(
-        pictures,
-        scene_view(header),
-        gripper_view(axes),
-        column_shares=[share, 1.05, 1],
-    )
+    case, name, first = "", "what happened", ""
+    if diagnosis is not None:
+        case, first = diagnosis.case, diagnosis.camera
+        name = f"{case}: {diagnosis.sub_case}"
+    seen = [named_view(camera.name) for camera in header.cameras]
+    voting = _voting(header)
+    evidence: list[Part] = []
+    if voting:
+        active = voting.index(first) if first in voting else 0
+        evidence.append(rrb.Tabs(*map(vote_picture_view, voting), active_tab=active))
+    if axes.gripper_cm is not None:
+        evidence.append(gripper_view(axes))
+    elif voting:
+        evidence.append(track_score_view(axes))
+    shares = [0.8, 1.0] if case in ("case 3", "unprompted") else [1.0, 0.8]
+    shares = shares[: len(evidence)]
+    if len(seen) == 1:
+        beside = [rrb.Vertical(*evidence, row_shares=shares)] if evidence else []
+        return rrb.Horizontal(*seen, *beside, name=name)
+    rows: list[Part] = [rrb.Horizontal(*seen)] if seen else []
+    if evidence:
+        rows.append(rrb.Horizontal(*evidence, column_shares=shares))
+    return rrb.Vertical(*rows, name=name)
 
 
-def _camera_grid(header: EpisodeHeader) -> tuple[Part, float]:
-    """The pictures of every camera, and their share of the width.
-
-    The pictures are squares in a box of about 10 : 7.
-    """
-    n_cameras = len(header.cameras)
-    grid: list[Part] = []
-    for camera in header.cameras:
-        track_title, vote_title = "track, truth", "vote at t = 0"
-        if n_cameras == 2:
-            track_title, vote_title = "track", "vote"
-        pictures = [track_view(camera.name, track_title)]
-        for j, grounding in enumerate(header.groundings.get(camera.name, ())):
-            title = vote_title if j == 0 else f"vote, {grounding.object}"
-            pictures.append(vote_view(camera.name, title, j))
-        policy = policy_view(camera.name)
-        if n_cameras <= 2:
-            grid.append(rrb.Vertical(policy, rrb.Horizontal(*pictures), row_shares=[5, 3]))
-        else:
-            grid.append(rrb.Horizontal(policy, *pictures))
-    if n_cameras > 2:
-        return rrb.Vertical(*grid), 0.44
-    return rrb.Horizontal(*grid), 0.4 if n_cameras == 1 else 0.52
-
-
-def _time_course(header: EpisodeHeader, axes: Axes, *, with_gripper: bool = True) -> Part:
+def _time_course(header: EpisodeHeader, axes: Axes) -> Part:
     """Instruction, curves and events."""
-    curves = robot_curve_views(header, axes)
-    if with_gripper:
-        curves.insert(0, gripper_view(axes))
-    parts = [instruction_view(), rrb.Tabs(*curves, active_tab=0)]
-    shares = [1.0, 1.0]
-    of_method = method_curve_views(header, axes)
-    if of_method:
-        parts.append(rrb.Tabs(*of_method, active_tab=0))
-        shares.append(0.75)
-    parts.append(events_view())
-    return rrb.Horizontal(*parts, column_shares=[*shares, EVENTS_SHARE])
+    n_arm = len(header.action_names) - 1
+    curves: list[Part] = [
+        _curve_view("/action", "action", axes, visible=[True] * n_arm + [False]),
+        _curve_view("/action", "gripper", axes, visible=[False] * n_arm + [True]),
+        _curve_view("/observation.state", "state", axes),
+    ]
+    if _voting(header):
+        curves += [
+            track_score_view(axes),
+            _curve_view("/vap/vote_margin", "margin", axes, UNIT_RANGE),
+        ]
+    parts = [instruction_view(), rrb.Tabs(*curves, active_tab=0), events_view()]
+    return rrb.Horizontal(*parts, column_shares=[0.8, 1.2, 1.2])
 
 
 def _voting(header: EpisodeHeader) -> list[str]:

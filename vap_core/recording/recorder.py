@@ -4,8 +4,7 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
 
 - `/observation.images.<camera>`: the raw picture. Below it `/prompted` is what the policy saw,
   `/candidates` the boxes over the picture that the vote was held on, `/mask/{target,gt}` track and
-  truth, `/identity` the prompt in the colour of the object it covers, `/attention/<query>`
-  overlays.
+  truth, `/identity` the objects' outlines and names, `/attention/<query>` overlays.
 - `/observation.state`, `/action`, `/next.reward`, `/next.success`.
 - `/vap/{votes,candidates}/<camera>`: the vote in numbers, `/vap/vote_picture/<camera>` its picture.
 - `/vap/association`: what the views agreed on, where they were associated.
@@ -19,7 +18,7 @@ Pictures are JPEG or AV1, at the steps that have them; everything that changes t
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +28,7 @@ import rerun as rr
 
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import code_version
-from vap_core.base.types import Event
+from vap_core.base.types import Event, Grounding, Mask
 from vap_core.recording.colours import image_root
 from vap_core.recording.entities.curves import (
     log_method_styles,
@@ -50,12 +49,11 @@ from vap_core.recording.entities.pictures import (
     Pictures,
     StillPictures,
     VideoPictures,
-    coverage_classes,
     encode_jpeg,
     jpeg_image,
     send_attention,
-    send_coverage,
     send_masks,
+    send_outlines,
 )
 from vap_core.recording.entities.scene import (
     log_cameras,
@@ -66,7 +64,12 @@ from vap_core.recording.entities.scene import (
     send_camera_poses,
     send_truth,
 )
-from vap_core.recording.entities.votes import log_association, log_vote, log_vote_picture
+from vap_core.recording.entities.votes import (
+    log_association,
+    log_vote,
+    log_vote_picture,
+    mean_cosines,
+)
 from vap_core.recording.layout import Axes, episode_blueprint
 from vap_core.recording.stream import (
     finish_stream,
@@ -86,6 +89,7 @@ from vap_core.rollout.types import (
     Explanation,
     Frame,
     SubGoalSpan,
+    covered_object,
 )
 from vap_core.simulation.types import EpisodeRow, Outcome
 
@@ -214,8 +218,7 @@ class Recorder:
         header = self._header
         rec.send_recording_name(f"{header.row.key} · {header.method}")
         log_properties(rec, "rollout", rollout_properties(header))
-        classes = rr.AnnotationContext([*CLASSES, *coverage_classes(header)])
-        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, classes)
+        log_row(rec, "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(CLASSES))
         log_row(rec, "/vap/instruction", instruction_document(header))
         log_table(rec, header.row)
         log_objects(rec, header)
@@ -256,21 +259,13 @@ class Recorder:
         if not groundings:
             log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
             return
-        right = _elected_target(frame, camera, self._goal.row.target)
-        log_vote(rec, groundings[0], 0, jpeg, at, right, again)
-        for j, grounding in enumerate(groundings[1:], start=1):
-            log_vote(rec, grounding, j, jpeg, at, again=again)
         for j, grounding in enumerate(groundings):
+            yours = None
+            if j == 0 and frame.truth.masks.get(camera):
+                yours = _right_candidate(grounding, frame.truth.masks[camera], self._goal)
             references = self._header.references.get(grounding.object, ())
-            log_vote_picture(
-                rec,
-                grounding,
-                j,
-                rgb=rgb,
-                references=references,
-                right=right if j == 0 else None,
-                at=at,
-            )
+            log_vote(rec, grounding, j, jpeg, at, yours, again)
+            log_vote_picture(rec, grounding, j, rgb, references, yours, at)
 
     def _flush(self) -> None:
         """Send the buffered frames as columns and write them to the file."""
@@ -294,15 +289,14 @@ class Recorder:
         self._unsent = []
 
     def _send_views(self, frames: list[Frame]) -> None:
-        """Masks, coverage and attention of the frames that have them."""
+        """Masks, outlines and attention of the frames that have them."""
         rec = self._open_stream()
         pictured = [frame for frame in frames if frame.images]
         if pictured:
             index = frame_times(pictured)
             send_masks(rec, self._goal, index, pictured)
-            if any(frame.coverage for frame in pictured):
-                stage = max(len(self._spans) - 1, 0)
-                send_coverage(rec, self._header, index, pictured, stage)
+            if any(frame.truth.masks for frame in pictured):
+                send_outlines(rec, self._goal, index, pictured)
         attended = [frame for frame in frames if frame.attention]
         if attended:
             send_attention(rec, attended, JPEG_QUALITY)
@@ -369,12 +363,14 @@ class Recorder:
         return events
 
 
-def _elected_target(frame: Frame, camera: str, target: str) -> bool | None:
-    """Whether the vote of a view elected the target; None where nothing says so."""
-    for view in frame.coverage:
-        if view.camera == camera and view.object is not None:
-            return view.object == target
-    return None
+def _right_candidate(grounding: Grounding, masks: Mapping[str, Mask], header: EpisodeHeader) -> int:
+    """The candidate that is the target by its mask, the winner where it is one; -1 for none."""
+    order = np.argsort(-mean_cosines(grounding), kind="stable").tolist()
+    if grounding.winner is not None:
+        order.insert(0, grounding.winner)
+    target = header.row.target
+    found = (i for i in order if covered_object(grounding.masks[i], masks) == target)
+    return next(found, -1)
 
 
 def rollout_properties(header: EpisodeHeader) -> rr.AnyValues:

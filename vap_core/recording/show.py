@@ -227,7 +227,7 @@ def connect_viewer(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
             return client
-        except (RuntimeError, ConnectionError):
+        except (RuntimeError, OSError):  # on a busy machine it times out, too
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)
@@ -544,7 +544,7 @@ def _gripper_chart(names: list[str]) -> rrb.View:
     return rrb.TimeSeriesView(
         origin="/",
         contents=list(overrides),
-        name="gripper to target, cm",
+        name="distance to yours, cm",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
         overrides=overrides,
     )
@@ -554,7 +554,7 @@ def _prompted_view(name: str, image_root: str) -> rrb.Spatial2DView:
     camera = image_root.removeprefix("observation.images.")
     return rrb.Spatial2DView(
         origin=f"/{name}/{image_root}",
-        contents=[f"/{name}/{image_root}/prompted"],
+        contents=[f"/{name}/{image_root}/prompted", f"/{name}/{image_root}/identity/**"],
         name=f"{name} · {camera}",
         background=BACKGROUND,
     )

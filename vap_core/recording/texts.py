@@ -3,7 +3,7 @@
 import rerun as rr
 
 from vap_core.base.events import describe_ballot, describe_rejection
-from vap_core.base.pictures import LEGEND
+from vap_core.base.pictures import LEGEND, object_labels
 from vap_core.base.types import Grounding, PersonalObject
 from vap_core.rollout.types import Diagnosis, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Outcome
@@ -35,31 +35,52 @@ def describe_outcome(outcome: Outcome) -> str:
     return ", ".join(parts)
 
 
-def verdict_line(target: str, outcome: Outcome, diagnosis: Diagnosis | None) -> str:
-    """How an episode ended, such as "FAILURE · Case 2 · side tints cup-2, front tints yours"."""
+DONE = {"picked": "picked", "near": "moved", "put": "placed", "selected": "selected"}
+"""What a success did, by the rule of the task."""
+CAUSES = {
+    "case 1": "wrong mask (Case 1): ",
+    "case 2": "views disagree (Case 2): ",
+    "case 3": "right prompt, failed hand (Case 3): ",
+    "unprompted": "no prompt: ",
+}
+
+
+def verdict_line(header: EpisodeHeader, outcome: Outcome, diagnosis: Diagnosis | None) -> str:
+    """How an episode ended, such as "SUCCESS · picked your cup in 37 steps · "pick up my cup""."""
+    row = header.row
     parts = [outcome.status.upper()]
-    if diagnosis is None:
-        parts.append(f"{outcome.steps} steps")
-        if outcome.detail:
-            parts.append(outcome.detail)
-        return " · ".join(parts)
-    parts.append(diagnosis.case.capitalize())
-    shown = _tinted(diagnosis, target)
-    if diagnosis.case != "case 2" or not shown:
-        parts.append(diagnosis.sub_case)
-    if shown:
-        parts.append(shown)
-    return " · ".join(parts)
+    if diagnosis is not None:
+        shown = _tinted(diagnosis, row.target)
+        cause = CAUSES.get(diagnosis.case, "")
+        parts.append(cause + _plain(header, shown or diagnosis.sentence))
+    elif outcome.success:
+        done = f"{DONE[row.rule]} your {row.category}" if row.rule in DONE else "done"
+        parts.append(f"{done} in {outcome.steps} steps")
+    else:
+        parts += filter(None, [f"{outcome.steps} steps", outcome.detail])
+    return " · ".join([*parts, f'"{header.rewritten}"'])
 
 
 def verdict_document(
     header: EpisodeHeader, outcome: Outcome, diagnosis: Diagnosis | None
 ) -> rr.TextDocument:
-    """The verdict as a heading; below it, for a failure, the sentence that explains it."""
-    line = f"## {verdict_line(header.row.target, outcome, diagnosis)}"
+    """The verdict as a heading; below it why, who it was, and of what episode."""
+    row = header.row
+    policy = header.policy.rpartition(":")[2].partition("@")[0]
+    about = [header.method, policy, f"{row.suite} {row.task} {row.episode}"]
     if diagnosis is not None:
-        line += f"\n\n{diagnosis.sentence} · opens at frame {diagnosis.frame_index}"
-    return _markdown(line)
+        about.insert(0, f"decided at step {diagnosis.frame_index}")
+        if diagnosis.case == "case 1":
+            about.insert(0, _plain(header, diagnosis.sentence.partition(";")[0]))
+    return _markdown(f"### {verdict_line(header, outcome, diagnosis)}\n\n{' · '.join(about)}")
+
+
+def _plain(header: EpisodeHeader, text: str) -> str:
+    """A text with every object called as the pictures call it."""
+    labels = object_labels(list(header.object_sizes_m), header.row.target)
+    for name in sorted(labels, key=len, reverse=True):
+        text = text.replace(name, labels[name])
+    return text
 
 
 def instruction_document(header: EpisodeHeader, outcome: str = "") -> rr.TextDocument:
@@ -88,21 +109,13 @@ def _tinted(diagnosis: Diagnosis, target: str) -> str:
     for name, label in diagnosis.evidence.items():
         if name.startswith("shows_"):
             views.setdefault(str(label), []).append(name.removeprefix("shows_"))
-    yours = views.pop(target, [])
     parts = []
-    for label, cameras in views.items():
+    for label in sorted(views, key=lambda label: label == target):
         thing = "no object" if label.startswith("nothing in ") else label
-        parts.append(_tint_words(cameras, thing))
-    if yours:
-        parts.append(_tint_words(yours, "yours"))
+        *names, last = views[label]
+        verb = "tint" if names else "tints"
+        parts.append(f"{' and '.join([*filter(None, [', '.join(names)]), last])} {verb} {thing}")
     return ", ".join(parts)
-
-
-def _tint_words(cameras: list[str], thing: str) -> str:
-    names = cameras[0]
-    if len(cameras) > 1:
-        names = f"{', '.join(cameras[:-1])} and {cameras[-1]}"
-    return f"{names} {'tint' if len(cameras) > 1 else 'tints'} {thing}"
 
 
 def grounding_document(

@@ -30,6 +30,8 @@ STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 MARGIN_WIDTH, SCORE_WIDTH, GRIPPER_WIDTH, LIFT_WIDTH, BAR_WIDTH = 2.5, 2.0, 2.5, 1.0, 6.0
 CLOSED = 0.5
 """A smaller command closes the gripper."""
+type Curve = tuple[str, str, Rgb8, float, np.ndarray]
+"""Entity, words of the legend, colour, width, and the numbers of a line."""
 BAR_SHARE = 0.05
 """How far the bars of the grasp are below zero, as a share of the largest distance."""
 
@@ -117,19 +119,22 @@ def send_gripper(
     chart's axis, from below the bars to above all curves.
     """
     index = frame_times(frames)
-    curves: list[tuple[str, Rgb8, float, np.ndarray]] = []
+    curves: list[Curve] = []
     if not header.row.start.absent:
         lift_cm = 100 * trace.lift_m[trace.target]
-        curves.append(("gripper to target", TARGET, GRIPPER_WIDTH, 100 * trace.gap_m))
-        curves.append(("target lifted", TARGET, LIFT_WIDTH, lift_cm))
+        to_target_cm = 100 * trace.gap_m
+        curves.append(("gripper_to_target", "to yours", TARGET, GRIPPER_WIDTH, to_target_cm))
+        words = "yours lifted (thin line)"
+        curves.append(("target_lifted", words, TARGET, LIFT_WIDTH, lift_cm))
     other_m = nearest_other_m(header, frames)
     if other_m is not None:
-        curves.append(("nearest other", LOOKALIKES[0], GRIPPER_WIDTH, 100 * other_m))
+        words = "to the nearest other"
+        curves.append(("nearest_other", words, LOOKALIKES[0], GRIPPER_WIDTH, 100 * other_m))
     highest = max([1.0, *(float(values.max()) for *_, values in curves)])
     curves += _grasp_bars(trace, frames, -BAR_SHARE * highest)
-    for name, colour, width, values in curves:
-        entity = f"/vap/hand/{name.replace(' ', '_')}"
-        log_row(rec, entity, rr.SeriesLines(names=[name], colors=[colour], widths=[width]))
+    for name, words, colour, width, values in curves:
+        entity = f"/vap/hand/{name}"
+        log_row(rec, entity, rr.SeriesLines(names=[words], colors=[colour], widths=[width]))
         send_curve(rec, entity, index, values)
     if diagnosis is not None and curves:
         *_, distances_cm = curves[0]
@@ -137,21 +142,20 @@ def send_gripper(
     return -0.2 * highest, 1.05 * highest
 
 
-def _grasp_bars(
-    trace: EpisodeTrace, frames: Sequence[Frame], level: float
-) -> list[tuple[str, Rgb8, float, np.ndarray]]:
+def _grasp_bars(trace: EpisodeTrace, frames: Sequence[Frame], level: float) -> list[Curve]:
     """Where the hand is closed, and what it touches or holds then; nan elsewhere."""
     states = [grasp_state(frame, trace.target) for frame in frames]
     conditions = (
-        ("hand closed", MUTED, 2.6, trace.grip < CLOSED),
-        ("has the target", TARGET, 1.3, np.array([s.endswith("target") for s in states])),
-        ("has another", LOOKALIKES[0], 1.3, np.array([s.endswith("other") for s in states])),
+        ("hand_closed", MUTED, 2.6, trace.grip < CLOSED),
+        ("has_the_target", TARGET, 1.3, np.array([s.endswith("target") for s in states])),
+        ("has_another", LOOKALIKES[0], 1.3, np.array([s.endswith("other") for s in states])),
     )
     bars = []
     for name, colour, depth, flags in conditions:
         if flags.any():
             values = np.where(flags, depth * level, np.nan)
-            bars.append((name, colour, BAR_WIDTH, values))
+            words = f"bar: {name.replace('_', ' ').replace('the target', 'yours')}"
+            bars.append((name, words, colour, BAR_WIDTH, values))
     return bars
 
 
@@ -168,7 +172,7 @@ def _send_deciding_frame(
     at = trace.steps.index(diagnosis.frame_index)
     entity = "/vap/hand/deciding_frame"
     style = rr.SeriesPoints(
-        names=["deciding frame"], colors=[ELECTED], markers=["cross"], marker_sizes=[7.0]
+        names=["the deciding step"], colors=[ELECTED], markers=["cross"], marker_sizes=[7.0]
     )
     log_row(rec, entity, style)
     send_curve(rec, entity, frame_times([frames[at]]), distances_cm[at : at + 1])

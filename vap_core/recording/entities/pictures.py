@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import rerun as rr
 
+from vap_core.base.pictures import object_labels
 from vap_core.base.types import Camera, Mask, Rgb
+from vap_core.perception.boxes import mask_box
 from vap_core.policies.protocol import heat_map
-from vap_core.recording.colours import ELECTED, TARGET, image_root, object_colours, target_suffix
+from vap_core.recording.colours import CAMERAS, ELECTED, GOAL, TARGET, image_root, target_suffix
 from vap_core.recording.stream import Moment, frame_times, log_row, time_columns
 from vap_core.rollout.types import EpisodeHeader, Frame
 
@@ -208,12 +210,15 @@ def _send_packets(rec: rr.RecordingStream, entity: str, packets: Sequence[Packet
 TRACK_CLASS, TRUTH_CLASS = 1, 3
 """Class of a mask's inside; the class of its edge is the next number."""
 TRACK_EDGE_PX, TRUTH_EDGE_PX = 2, 1
+OTHER_CLASS, GOAL_CLASS, YOURS_CLASS = 5, 6, 7
+OUTLINES = {OTHER_CLASS: CAMERAS[0], GOAL_CLASS: GOAL, YOURS_CLASS: TARGET}
 CLASSES = [
     rr.AnnotationInfo(id=0, label="", color=(0, 0, 0, 0)),
     rr.AnnotationInfo(id=TRACK_CLASS, label="track", color=(*ELECTED, 90)),
     rr.AnnotationInfo(id=TRACK_CLASS + 1, label="track, edge", color=(*ELECTED, 255)),
     rr.AnnotationInfo(id=TRUTH_CLASS, label="truth", color=(*TARGET, 1)),
     rr.AnnotationInfo(id=TRUTH_CLASS + 1, label="truth, edge", color=(*TARGET, 255)),
+    *(rr.AnnotationInfo(id=i, label="", color=(*rgb, 255)) for i, rgb in OUTLINES.items()),
 ]
 """The edge has its own class so that track and truth stay apart where they agree."""
 
@@ -286,84 +291,54 @@ def _empty_image(camera: Camera) -> np.ndarray:
     return np.zeros((camera.height, camera.width), np.uint8)
 
 
-NO_OBJECT_CLASS = 8
-"""A prompt that covers no object."""
-FIRST_OBJECT_CLASS = 10
-"""Class of the first object's inside. An inside is even; its edge is the number after it. Every
-sub-goal has classes of its own, for another object is its target."""
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+LABEL_SHARES = 0.27, 0.08
+"""Width and height of an object's name, as shares of a picture's."""
 
 
-def coverage_classes(header: EpisodeHeader) -> list[rr.AnnotationInfo]:
-    """One colour for each object: an inside for the prompt that covers it, an edge for itself."""
-    classes = [rr.AnnotationInfo(id=NO_OBJECT_CLASS, label="no object", color=(255, 255, 255, 190))]
-    names = list(header.object_sizes_m)
-    for stage in range(header.row.stages):
-        row = header.row.at(stage)
-        for name, colour in object_colours(names, row.target, row.goal).items():
-            inside = _inside_class(names, name, stage)
-            classes.append(rr.AnnotationInfo(id=inside, label=name, color=(*colour, 170)))
-            classes.append(
-                rr.AnnotationInfo(id=inside + 1, label=f"{name}, edge", color=(*colour, 255))
-            )
-    return classes
-
-
-def send_coverage(
+def send_outlines(
     rec: rr.RecordingStream,
     header: EpisodeHeader,
     index: Sequence[rr.TimeColumn],
     frames: Sequence[Frame],
-    stage: int = 0,
 ) -> None:
-    """One class image per view and step; the steps are those with truth and pictures.
-
-    `stage` is the sub-goal of all frames.
-    """
-    for i, camera in enumerate(frames[0].cameras):
-        images = [coverage_image(header, frame, frame.cameras[i], stage) for frame in frames]
-        send_class_images(rec, f"{image_root(camera.name)}/identity", index, images)
-
-
-def coverage_image(
-    header: EpisodeHeader, frame: Frame, camera: Camera, stage: int = 0
-) -> np.ndarray:
-    """Class image of one view: the prompt's inside, and over it the edges of all objects."""
-    names = list(header.object_sizes_m)
-    image = np.zeros((camera.height, camera.width), np.uint8)
-    tracks = frame.tracks.get(camera.name, ())
-    covered = _covered_object(frame, camera)
-    if tracks and tracks[0].mask is not None and covered is not None:
-        image[tracks[0].mask] = NO_OBJECT_CLASS
-        if covered in names:
-            image[tracks[0].mask] = _inside_class(names, covered, stage)
-    edges = _object_edges(frame.truth.masks.get(camera.name, {}), names, image, stage)
-    return np.where(edges > 0, edges, image)
-
-
-def _covered_object(frame: Frame, camera: Camera) -> str | None:
-    for view in frame.coverage:
-        if view.camera == camera.name:
-            return view.object
-    return None
-
-
-def _inside_class(names: Sequence[str], name: str, stage: int) -> int:
-    return FIRST_OBJECT_CLASS + 2 * (len(names) * stage + names.index(name))
-
-
-def _object_edges(
-    masks: Mapping[str, Mask], names: Sequence[str], like: np.ndarray, stage: int
-) -> np.ndarray:
-    """The edge class on the outermost pixels of every object, 0 elsewhere."""
-    owner = np.zeros_like(like)
-    for name in names:
-        if name in masks:  # every visible pixel belongs to one object
-            edge = _inside_class(names, name, stage) + 1
-            owner |= masks[name].view(np.uint8) * np.uint8(edge)
-    interior = cv2.erode(owner, CROSS) == cv2.dilate(owner, CROSS)
-    owner[interior] = 0
-    return owner
+    """Every object's outline around its own pixels, and below it what it is to the user."""
+    row = header.row
+    labels = object_labels(list(header.object_sizes_m), row.target)
+    classes = {row.goal: GOAL_CLASS, row.target: YOURS_CLASS}
+    for camera in frames[0].cameras:
+        images, lengths = [], []
+        spots: list[tuple[float, float]] = []
+        names: list[str] = []
+        room_x, room_y = LABEL_SHARES[0] * camera.width, LABEL_SHARES[1] * camera.height
+        for frame in frames:
+            owner, before = _empty_image(camera), len(names)
+            for name, mask in frame.truth.masks.get(camera.name, {}).items():
+                box = mask_box(mask)
+                if box is not None and name in labels:
+                    owner |= mask.view(np.uint8) * np.uint8(classes.get(name, OTHER_CLASS))
+                    names.append(name)
+                    x0, y0, x1, y1 = box.tolist()
+                    x, y = (x0 + x1) / 2, y1 + 2
+                    if y1 > camera.height - room_y:
+                        y = y0 - room_y
+                    while any(
+                        abs(x - a) < room_x and abs(y - b) < room_y for a, b in spots[before:]
+                    ):
+                        y += room_y
+                    spots.append((x, y))
+            images.append(np.where(owner == 0, cv2.dilate(owner, CROSS), 0).astype(np.uint8))
+            lengths.append(len(names) - before)
+        entity = f"{image_root(camera.name)}/identity"
+        send_class_images(rec, entity, index, images)
+        points = rr.Points2D.columns(
+            positions=np.array(spots, np.float32).reshape(-1, 2),
+            labels=[labels[name] for name in names],
+            colors=[OUTLINES[classes.get(name, OTHER_CLASS)] for name in names],
+        )
+        rec.send_columns(f"{entity}/labels", index, points.partition(lengths))
+        static = rr.Points2D.from_fields(radii=0, show_labels=True)
+        log_row(rec, f"{entity}/labels", static)
 
 
 def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], jpeg_quality: int) -> None:

@@ -101,13 +101,14 @@ def log_vote(
     j: int,
     jpeg: np.ndarray | None,
     at: Sequence[rr.TimeColumn],
-    right: bool | None = None,
+    yours: int | None = None,
     again: bool = False,
 ) -> None:
     """The vote of target j in one view: labelled boxes over the picture, and numbers.
 
-    `right` says whether it elected the target, where that is known. Where it is held `again`, for
-    another sub-goal, a vote without candidates takes the boxes of the one before away.
+    `yours` is the candidate that is the target, -1 where none is, None where that is unknown.
+    Where it is held `again`, for another sub-goal, a vote without candidates takes the boxes of
+    the one before away.
     """
     name = f"{grounding.camera}{target_suffix(j)}"
     order = _drawing_order(grounding)
@@ -115,7 +116,7 @@ def log_vote(
     if jpeg is not None:
         log_row(rec, entity, jpeg_image(jpeg), at=at)
     if order:
-        _log_boxes(rec, entity, grounding, order, at, right)
+        _log_boxes(rec, entity, grounding, order, at, yours)
         counts = rr.AnyValues(counts=grounding.ballot.votes)
         log_row(rec, f"/vap/votes/{name}", counts, at=at)
     elif again:
@@ -174,7 +175,7 @@ def _log_boxes(
     grounding: Grounding,
     order: list[int],
     at: Sequence[rr.TimeColumn],
-    right: bool | None,
+    yours: int | None,
 ) -> None:
     """Every candidate's box, and the labels that have room; `order` is that of drawing."""
     xyxy = grounding.candidates.xyxy[order]
@@ -188,7 +189,7 @@ def _log_boxes(
         radii.append(WINNER_RADIUS_PT if is_winner else OTHER_RADIUS_PT)
         long_labels.append(_long_label(grounding, i))
         labels.append(f"#{i} v{grounding.ballot.votes[i]}")
-    labels[-1] = _top_label(grounding, order[-1], right)
+    labels[-1] = _top_label(grounding, order[-1], yours)
     boxes = rr.Boxes2D(
         array=xyxy.reshape(-1, 4),
         array_format=rr.Box2DFormat.XYXY,
@@ -218,14 +219,14 @@ def _long_label(grounding: Grounding, i: int) -> str:
     return f"#{i} {score:.2f} · {votes} · cos {mean_cosines(grounding)[i]:.2f}"
 
 
-def _top_label(grounding: Grounding, i: int, right: bool | None) -> str:
+def _top_label(grounding: Grounding, i: int, yours: int | None) -> str:
     """The label of the candidate on top: the ballot's words when it was elected."""
     label = _long_label(grounding, i)
     if i == grounding.ballot.winner:
         label = f"#{i} {describe_ballot(grounding)}"
-    if right is None or i != grounding.winner:
+    if yours is None or i != grounding.winner:
         return label
-    return f"{RIGHT_MARK if right else WRONG_MARK} {label}"
+    return f"{RIGHT_MARK if i == yours else WRONG_MARK} {label}"
 
 
 def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
@@ -279,10 +280,10 @@ def log_vote_picture(
     j: int,
     rgb: Rgb,
     references: Sequence[Rgb],
-    right: bool | None,
+    yours: int | None,
     at: Sequence[rr.TimeColumn],
 ) -> None:
-    """The vote of target j; `right` says whether it elected the target, where that is known."""
-    picture = vote_picture(grounding, rgb, references, right=right)
+    """The vote of target j; `yours` as in `log_vote`."""
+    picture = vote_picture(grounding, rgb, references, yours=yours)
     jpeg = jpeg_image(encode_jpeg(picture, JPEG_QUALITY))
     log_row(rec, vote_picture_entity(grounding.camera, j), jpeg, at=at)
