@@ -133,7 +133,7 @@ def test_the_recording_opens_with_its_outcome_and_a_tab_per_query(
     assert {"attention", *QUERIES} <= tabs(path)
     verdict = columns(path, "/vap/verdict", "TextDocument:text")
     assert summary["outcome"].upper() in str(verdict[None]).upper()
-    assert {"/vap/events", "/vap/instruction", "/vap/status/outcome"} <= entities(path)
+    assert {"/vap/events", "/vap/instruction", "/vap/verdict"} <= entities(path)
     listed = pd.read_parquet(RUN)
     row = listed[(listed["task"] == "pick-shaver") & (listed["method"] == "soft") & (listed["episode"] == 12)].iloc[0]  # fmt: skip
     ended_so = (summary["outcome"], summary["steps"]) == (row["outcome"], row["steps"])

@@ -147,9 +147,10 @@ def test_a_method_that_reads_the_simulator_is_dashed() -> None:
 
 def test_a_report_of_methods_that_highlight_nothing_has_their_failures(tmp_path: Path) -> None:
     of_generic = TABLE[TABLE.method == "generic"].dropna(axis="columns", how="all")
-    table = of_generic.assign(task="select-cup", episode=[0, 1], seed=0, policy="p")
+    about = {"task": "select-cup", "seed": 0, "policy": "p", "case_sentence": "because"}
+    table = of_generic.assign(**about, episode=[0, 1])
     page = report_page(
-        Runs(table, table[:0], {}, ()), {}, pictures.empty_figure(1.0, 1.0), [], tmp_path
+        Runs(table, table[:0], {}, ()), [], {}, pictures.empty_figure(1.0, 1.0), [], tmp_path
     )
     assert "Where episodes are lost" in page
     assert "Failures (2)" in page
@@ -171,8 +172,8 @@ def test_a_page_leaves_out_recorded_failures_of_runs_older_than_the_diagnosis(
         (tmp_path / "recordings" / name).write_bytes(b"")
     forest = pictures.empty_figure(1.0, 1.0)
     table = pd.DataFrame(rows)
-    page = report_page(Runs(table, table[:0], {}, ()), {}, forest, [tmp_path], tmp_path)
+    page = report_page(Runs(table, table[:0], {}, ()), [], {}, forest, [tmp_path], tmp_path)
     assert "Failures (1)" in page
-    assert page.count("<article>") == 1
+    assert page.count("<article ") == 1
     assert "episode 0 · generic" in page
     assert "2 more of runs older than the diagnosis are left out" in page

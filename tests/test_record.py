@@ -62,8 +62,6 @@ def test_every_entity_has_its_promised_name(three: tuple[Path, EpisodeHeader, li
         "/vap/events",
     ]
     status = [
-        "/vap/status/outcome",
-        "/vap/status/grasp",
         "/__properties/rollout",
         "/__properties/outcome",
     ]

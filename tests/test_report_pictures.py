@@ -38,17 +38,21 @@ def test_a_failure_is_pictured_by_the_recording_of_its_own_policy(
     monkeypatch.setattr("vap_core.recording.read_summary", summary)
     of_b = {**row, "policy": "b"}
     path = sources[1] / "recordings" / name
-    assert list(report._recorded([of_b], sources)) == [(of_b, path)]
-    assert not list(report._recorded([{**row, "policy": "c"}], sources))
+    assert report._recorded(of_b, sources) == path
+    assert report._recorded({**row, "policy": "c"}, sources) is None
     for other in ({**whole, "episode": 4}, {**whole, "method": "generic"}, row):
         said = other
-        assert not list(report._recorded([of_b], sources))
+        assert report._recorded(of_b, sources) is None
 
 
 def test_a_card_gives_a_command_for_a_shell(tmp_path: Path) -> None:
     row = dict.fromkeys(("suite", "task", "method", "case", "sub_case", "case_sentence"), "a")
-    card = report._card({**row, "episode": 1, "deciding_frame": 2}, tmp_path / "a b.rrd", tmp_path)
+    row |= {"episode": 1, "seed": 0, "deciding_frame": 2}
+    card = report._card(row, tmp_path / "a b.rrd", [tmp_path], tmp_path)
     assert f"view &#x27;{tmp_path}/a b.rrd&#x27; --frame 2" in card
+    without = report._card(row, None, [tmp_path], tmp_path)
+    assert f"diagnose {tmp_path} --suite a --task a --method a --where" in without
+    assert without.startswith("<article data-case='a' data-task='a'>"), "what the page filters by"
 
 
 def test_a_recording_with_damaged_pictures_is_a_remark(tmp_path: Path) -> None:
@@ -57,7 +61,7 @@ def test_a_recording_with_damaged_pictures_is_a_remark(tmp_path: Path) -> None:
     record(path, opening(), steps=4)
     row = dict.fromkeys(("suite", "task", "method", "case", "sub_case", "case_sentence"), "a")
     row |= {"episode": 1, "deciding_frame": 2}
-    assert "<img" in report._card(row, path, tmp_path)
+    assert "<img" in report._card(row, path, [], tmp_path)
     whole = path.read_bytes()
     for damaged in (
         whole[: len(whole) // 2],
@@ -65,6 +69,6 @@ def test_a_recording_with_damaged_pictures_is_a_remark(tmp_path: Path) -> None:
         whole[: len(whole) // 3] + bytes(200) + whole[len(whole) // 3 + 200 :],
     ):
         path.write_bytes(damaged)
-        card = report._card(row, path, tmp_path)
-        assert "<article>" in card
+        card = report._card(row, path, [], tmp_path)
+        assert "<article" in card
         assert "<img" in card or "its pictures cannot be read (" in card

@@ -8,9 +8,12 @@ import inspect
 import os
 import re
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from traceback import walk_stack
 from typing import Any
 
 import typer
@@ -24,6 +27,7 @@ worked or failed.
 
 Start with: ./vap doctor, then ./vap demo."""
 INTERRUPTED = 130
+PATIENCE_S = 5.0
 AS_WRITTEN = re.compile(r"^(?:--[\w-]+=)?(~\w*|\$\w+|\$\{\w+\})(?:/|$)")
 """How a word begins that the shell expands unless it is quoted."""
 
@@ -95,6 +99,25 @@ class Terminal:
         return getattr(self._stream, name)
 
 
+def tell(thread: int) -> None:
+    """Say in longer and longer intervals, while no bar moves, which function runs, and how long."""
+    from tqdm import tqdm
+
+    seconds = PATIENCE_S
+    time.sleep(seconds)
+    while True:
+        codes = [frame.f_code for frame, _ in walk_stack(sys._current_frames()[thread])]
+        names = [
+            code.co_name.replace("_", " ")
+            for code in codes
+            if re.search("vap_core/(?!cli)", code.co_filename) and code.co_name.isidentifier()
+        ]
+        if names and not tqdm._instances:
+            print(f"{sys.argv[1]}: {names[-1].strip()}, {seconds:.0f} s so far", file=sys.stderr)
+        time.sleep(seconds)
+        seconds *= 2
+
+
 def main() -> None:
     """Run the command line; an error that the user can correct is printed as one line."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -102,6 +125,8 @@ def main() -> None:
     out = Terminal(sys.stdout or nowhere)
     errors = Terminal(sys.stderr or nowhere, "\n\t\r")
     with nowhere, redirect_stdout(out), redirect_stderr(errors):
+        if sys.__stderr__ is not None and sys.__stderr__.isatty() and "serve" not in sys.argv:
+            threading.Thread(target=tell, args=(threading.get_ident(),), daemon=True).start()
         _run()
 
 
@@ -139,8 +164,8 @@ def _run() -> None:
     except SystemExit as stop:
         if stop.code == INTERRUPTED:
             print(
-                "interrupted; run the same command again. With a run folder it goes on where it "
-                "stopped.",
+                "interrupted; a run folder keeps what is finished. To go on: "
+                + errors.command(*sys.argv[1:]),
                 file=sys.stderr,
             )
         raise

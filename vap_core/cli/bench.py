@@ -63,7 +63,7 @@ def measure(arms: Sequence[Arm], repeats: int, warm: int = 1) -> None:
     """Run all arms in turn, each time beginning with another one; warm repeats do not count."""
     from tqdm import tqdm
 
-    for repeat in tqdm(range(-warm, repeats), unit="repeat", disable=None):
+    for repeat in tqdm(range(-warm, repeats), "bench", unit="repeat", disable=None):
         for i in range(len(arms)):
             arms[(i + repeat) % len(arms)].repeat()
         if repeat < 0:

@@ -117,7 +117,7 @@ def events_view() -> Part:
 
 def track_score_view(axes: Axes = DEFAULT_AXES) -> Part:
     """How sure the tracker is of the target, in every view."""
-    return _curve_view("/vap/track_score", "score", axes, UNIT_RANGE)
+    return _curve_view("/vap/track_score", "track score", axes, UNIT_RANGE)
 
 
 def gripper_view(axes: Axes = DEFAULT_AXES) -> Part:

@@ -9,8 +9,8 @@ Timelines are `frame_index` and `timestamp`. Entities have the names of LeRobot'
 - `/vap/{votes,candidates}/<camera>`: the vote in numbers, `/vap/vote_picture/<camera>` its picture.
 - `/vap/association`: what the views agreed on, where they were associated.
 - `/vap/{vote_margin,track_score,attention}/<camera>`, `/vap/hand/*`: curves and tensors.
-- `/vap/{verdict,instruction,events}`, `/vap/status/{outcome,grasp}`: text and states; of an
-  instruction in several steps also `/vap/status/subgoal`.
+- `/vap/{verdict,instruction,events}`, text; of an instruction in several steps also
+  `/vap/status/subgoal`.
 - `/world/{table,robot/link*,objects/*}`: simulator truth.
 
 Evidence of a further target j ends in `_j`. Recording properties are in module `properties`.
@@ -33,12 +33,9 @@ from vap_core.recording.colours import image_root
 from vap_core.recording.entities.curves import (
     log_method_styles,
     log_robot_styles,
-    log_status_styles,
     send_events,
-    send_grasp_changes,
     send_gripper,
     send_method,
-    send_outcome,
     send_reward,
     send_robot,
     send_subgoals,
@@ -134,7 +131,6 @@ class Recorder:
         self._frames: list[Frame] = []
         """All frames, without images."""
         self._unsent: list[Frame] = []
-        self._grasp_state: str | None = None
         self._queries: tuple[str, ...] = ()
         self._has_layout = False
         recording_id = f"{row.key}.s{row.seed}.{header.method}.{header.policy}"
@@ -234,7 +230,6 @@ class Recorder:
         log_robot_styles(rec, self._header, frame)
         log_method_styles(rec, self._header)
         log_cameras(rec, frame)
-        log_status_styles(rec)
         log_links(rec, frame.truth)
         self._log_roles(frame)
         self._log_choice(frame)
@@ -280,9 +275,6 @@ class Recorder:
         send_robot(rec, index, frames)
         send_method(rec, self._goal, index, frames)
         send_truth(rec, index, frames)
-        self._grasp_state = send_grasp_changes(
-            rec, frames, self._goal.row.target, self._grasp_state
-        )
         self._subgoal = send_subgoals(rec, frames, self._header.row, self._subgoal)
         self._send_events([event for frame in frames for event in frame.events])
         flush_stream(rec, self.path)
@@ -331,7 +323,6 @@ class Recorder:
         rec = self._open_stream()
         index = frame_times(self._frames)
         send_reward(rec, index, len(self._frames), outcome.success)
-        send_outcome(rec, self._frames[0], outcome.status)
         self._send_events(self._ending_events(outcome, explanation.diagnosis))
         gripper_cm = None
         if explanation.trace is not None:

@@ -480,13 +480,12 @@ def combine_recordings(recordings: Mapping[str, Path], out: Path) -> None:
     recording_id = ".".join(["together", suite, task, episode, seed, *recordings])
     rec = open_stream(out, recording_id)
     rec.send_recording_name(" · ".join([suite, task, episode, " against ".join(recordings)]))
-    rows: list[rrb.Container | rrb.View] = []
-    for name, path in recordings.items():
-        rows.append(_method_row(name, _copy_below(rec, name, path)))
+    columns = [
+        _method_column(name, _copy_below(rec, name, path)) for name, path in recordings.items()
+    ]
     fps = next(iter(summaries.values())).get("hz") or 1.0
-    shares = [*[1.0] * len(rows), 0.62]
-    rows.append(_gripper_chart(list(recordings)))
-    full_window(rrb.Vertical(*rows, row_shares=shares), float(fps)).send(rec)
+    parts: list[Part] = [rrb.Horizontal(*columns), _gripper_chart(list(recordings))]
+    full_window(rrb.Vertical(*parts, row_shares=[0.72, 0.28]), float(fps)).send(rec)
     finish_stream(rec, out)
 
 
@@ -517,21 +516,11 @@ def _copy_below(rec: rr.RecordingStream, name: str, path: Path) -> list[str]:
     return roots
 
 
-def _method_row(name: str, image_roots: list[str]) -> rrb.Container:
-    """One method: its verdict above, its views as the policy saw them, and the scene."""
-    views: list[rrb.View] = [_prompted_view(name, root) for root in image_roots]
-    scene = rrb.Spatial3DView(
-        origin=f"/{name}",
-        contents=[f"/{name}/world/**"],
-        name=f"{name} · scene",
-        background=BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=False),
-    )
-    return rrb.Vertical(
-        verdict_view(f"/{name}/vap/verdict", name),
-        rrb.Horizontal(*views, scene),
-        row_shares=[0.29, 0.71],
-    )
+def _method_column(name: str, image_roots: list[str]) -> rrb.Container:
+    """One method: its verdict above its views as the policy saw them."""
+    views = [_prompted_view(name, root) for root in image_roots]
+    verdict = verdict_view(f"/{name}/vap/verdict", name)
+    return rrb.Vertical(verdict, rrb.Horizontal(*views), row_shares=[0.32, 0.68])
 
 
 def _gripper_chart(names: list[str]) -> rrb.View:

@@ -84,7 +84,7 @@ def _plain(header: EpisodeHeader, text: str) -> str:
 
 
 def instruction_document(header: EpisodeHeader, outcome: str = "") -> rr.TextDocument:
-    """The instruction and its rewrite, how the episode ended, every view's vote, the colours."""
+    """The instruction and its rewrite, how the episode ended, the colours."""
     row = header.row
     lines = [f'**said** "{header.instruction}"']
     if row.owned:
@@ -100,7 +100,7 @@ def instruction_document(header: EpisodeHeader, outcome: str = "") -> rr.TextDoc
         f"{header.method} · {header.policy}"
     )
     lines.append(f"*{LEGEND}*")
-    return _markdown("  \n".join(lines) + "\n\n" + _vote_table(header))
+    return _markdown("  \n".join(lines))
 
 
 def _tinted(diagnosis: Diagnosis, target: str) -> str:
@@ -138,16 +138,6 @@ def _owners(row: EpisodeRow) -> str:
         known = f" ({', '.join(owned.known_as)})" if owned.known_as else ""
         parts.append(f"{owned.owner}'s{known} {owned.model}")
     return ", ".join(parts)
-
-
-def _vote_table(header: EpisodeHeader) -> str:
-    rows = []
-    for camera, per_target in header.groundings.items():
-        for grounding in per_target:
-            rows.append(f"| {camera} | {describe_vote(grounding)} |")
-    if not rows:
-        return "*no grounding: this method does not prompt*"
-    return "\n".join(["| view | vote at t = 0 |", "| --- | --- |", *rows])
 
 
 def _markdown(text: str) -> rr.TextDocument:

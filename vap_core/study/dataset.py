@@ -90,7 +90,7 @@ def inspect_dataset(
     with ExitStack() as files:
         files.enter_context(store.locked(out))
         writer = None if copy is None else files.enter_context(Copy(recorded, copy, masks))
-        for episode in tqdm(range(count), unit="episode"):
+        for episode in tqdm(range(count), "inspect-dataset", unit="episode"):
             done = out / f"episode_{episode:06d}.json"
             if writer is not None or not (done.is_file() and done.with_suffix(".rrd").is_file()):
                 found = _inspect_episode(

@@ -354,6 +354,8 @@ def run(
         store.sweep(folder)
         store.compact(folder)
         if executor is results and missing():
+            if progress:
+                print(f"loading {study.policy}, {study.stack} perception ...", file=sys.stderr)
             prepare(worker_modules(study.policy))
         register_personal(study, folder / "memory")
         table = store.read(folder)
@@ -361,6 +363,7 @@ def run(
             total=len(study.methods) * sum(len(study.rows(*task)) for task in study.tasks),
             initial=len(table),
             unit="episode",
+            desc=", ".join(dict.fromkeys(suite for suite, _ in study.tasks)),
             disable=not progress,
             smoothing=0.05,
         ) as bar:

@@ -4,16 +4,15 @@ import base64
 import json
 import os
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from html import escape
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from vap_core.base.errors import BadOutput, BadRecording, command, number_of
+from vap_core.base.errors import BadOutput, BadRecording, command
 from vap_core.base.files import write_atomic, writing
 from vap_core.base.pictures import write_png
 from vap_core.simulation import suites
@@ -36,7 +35,6 @@ from vap_core.study.results import (
     errors,
     load_runs,
     outcomes,
-    paper_results,
     provenance,
     results,
     track_title,
@@ -47,9 +45,7 @@ from vap_core.study.stats import (
     TRACK,
     abstentions,
     compare,
-    layout_names,
     points_text,
-    rate,
     rate_of,
     score,
     step_times,
@@ -116,14 +112,8 @@ def rates_in(lines: "pd.DataFrame", name: str) -> list[str]:
     return list(map(percent_interval, *columns))
 
 
-def result_table(lines: "pd.DataFrame", published: "pd.DataFrame") -> "pd.DataFrame":
-    """The results of one track to print, a block per task with methods as rows.
-
-    `lines` are of `results.results`, `published` of `paper.main_results`. The paper's methods that
-    were not run stand below ours.
-    """
-    import pandas as pd
-
+def result_table(lines: "pd.DataFrame") -> "pd.DataFrame":
+    """Lines of `results.results` to print, with the paper's numbers where it has some."""
     n = lines["n"].astype(str) + " of " + lines["listed"].astype(str)
     seeds = " (" + lines["seeds"].astype(str) + " seeds)"
     table = lines[["task"]].assign(
@@ -140,20 +130,11 @@ def result_table(lines: "pd.DataFrame", published: "pd.DataFrame") -> "pd.DataFr
         table["over layouts"] = texts
     table["CMR % [95 %]"] = rates_in(lines, "cmr")
     table["wrong object % [95 %]"] = rates_in(lines, "wrong_object")
-    if published.empty:
-        return table
-    columns = {"paper_method": "paper's row", "paper_sr": "paper SR", "paper_cmr": "paper CMR"}
-    table[list(columns.values())] = lines[list(columns)]
-    ran = pd.MultiIndex.from_frame(lines[["task", "method"]])
-    others = published[~pd.MultiIndex.from_frame(published[["task", "method"]]).isin(ran)]
-    names = {"paper_method": "paper's row", "sr": "paper SR", "cmr": "paper CMR"}
-    below = others.drop(columns="method").rename(columns=names)[["task", *names.values()]]
-    whole = pd.concat([table.astype(object), below.astype(object)], ignore_index=True)
-    for name in ("paper SR", "paper CMR"):
-        whole[name] = whole[name].map(percent)
-    tasks = list(dict.fromkeys(lines["task"]))
-    whole = whole[whole["task"].isin(tasks)]
-    return whole.sort_values("task", key=lambda task: task.map(tasks.index), kind="stable")
+    if lines["paper_method"].notna().any():
+        table["paper's row"] = lines["paper_method"]
+        for name, column in {"paper SR": "paper_sr", "paper CMR": "paper_cmr"}.items():
+            table[name] = lines[column].map(percent)
+    return table
 
 
 def outcome_table(ends: "pd.DataFrame") -> "pd.DataFrame":
@@ -184,8 +165,13 @@ def comparison_table(compared: "pd.DataFrame") -> "pd.DataFrame":
         for line in compared.itertuples()
     ]
     for column, name in {"p_mcnemar": "p McNemar", "p": "p layouts", "p_holm": "p Holm"}.items():
-        table[name] = compared[column].map(lambda p: "< 0.001" if p < 0.001 else f"{p:.3f}")
+        table[name] = compared[column].map(p_text)
     return table[["suite", *table.columns.drop("suite")]]
+
+
+def p_text(p: float) -> str:
+    """A p-value."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 RESULTS_NOTE = (
@@ -230,7 +216,7 @@ ABSTENTION_NOTE = (
 def report(sources: Sequence[Path], out: Path) -> str:
     """Write report.md and report.html, its tables as CSV, forest.png and paired.png.
 
-    Returns report.md.
+    Returns what a terminal shows (`summary`).
 
     `sources` are run folders or published tables. An unfinished run is reported as it is, and
     marked. Rates in the CSV tables are fractions, as the names of their columns say.
@@ -242,21 +228,23 @@ def report(sources: Sequence[Path], out: Path) -> str:
     ends = outcomes(runs)
     origins = provenance(runs)
     compared = compare(runs.table, runs.methods)
+    shown = summary(runs, lines, compared)
     text = "\n\n".join(["# Report", *_sections(runs, lines, ends, compared, origins)])
     rates = [f"{name}{part}" for name in RATES for part in ("", "_low", "_high")]
     rates += ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
     figures = {"forest.png": forest(lines)}
     by_track = {
-        track_title(str(suite), str(split)): result_table(part, lines.iloc[:0])
+        track_title(str(suite), str(split)): result_table(part)
         for (suite, split), part in lines.groupby(TRACK, sort=False)
     }
     tables = {"Results": by_track, "Outcomes": {"": outcome_table(ends)}}
+    found = findings(lines, compared)
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv(lines, rates),
         "outcomes.csv": _csv(ends),
         "provenance.csv": _csv(origins),
-        "report.html": report_page(runs, tables, figures["forest.png"], sources, out),
+        "report.html": report_page(runs, found, tables, figures["forest.png"], sources, out),
     }
     if len(compared):
         files["comparisons.csv"] = _csv(compared, ["difference", "low", "high"])
@@ -269,7 +257,48 @@ def report(sources: Sequence[Path], out: Path) -> str:
             write_png(figure, out / name)
         for name in {"paired.png", "comparisons.csv"} - {*files, *figures}:  # of an earlier report
             (out / name).unlink(missing_ok=True)
-    return text
+    return shown
+
+
+MOST_FINDINGS, MOST_LINES = 5, 16
+"""Lines of a summary: of its findings, and of all of it."""
+
+
+def findings(lines: "pd.DataFrame", compared: "pd.DataFrame") -> list[str]:
+    """For every track and policy how often each method succeeds, best first, and by how much the
+    best is above the first method on the same episodes.
+    """
+    found = []
+    by = [*TRACK, "policy"]
+    for (suite, split, policy), part in lines.groupby(by, sort=False):
+        whole = part[part["task"].eq(part["task"].iloc[-1])]  # all tasks, where there are several
+        ranked = whole.sort_values("sr", ascending=False, kind="stable").to_dict("records")
+        rates = (f"{line['method']} {percent(line['sr'])} % of {line['n']}" for line in ranked)
+        text = f"{track_title(str(suite), str(split))} ({policy}): {', '.join(rates)}"
+        same = whole[[*by, "task", "method"]].rename(columns={"method": "one"}).head(1)
+        pairs = compared.merge(same).sort_values("difference", ascending=False).head(1)
+        for pair in pairs.itertuples():
+            points = points_text(pair, digits=1)
+            text += f"; {pair.other} - {pair.one}: {points} points, p {p_text(pair.p)}"
+        found.append(text)
+    return found
+
+
+def summary(runs: Runs, lines: "pd.DataFrame", compared: "pd.DataFrame") -> str:
+    """At most MOST_LINES lines for a terminal: the findings, what is missing, and why it failed."""
+    found = findings(lines, compared)
+    parts = found[:MOST_FINDINGS]
+    if len(found) > MOST_FINDINGS:
+        parts.append(f"and {len(found) - MOST_FINDINGS} more tracks: in the report")
+    parts += [f"unfinished: {line}" for line in runs.unfinished[:2]]
+    parts += [f"errors: {line}" for line in errors(runs)[:2]]
+    if "case" in runs.table and runs.table["outcome"].eq("failure").any():
+        why = sub_cases_text(breakdown(runs.table)).splitlines()
+        parts += [f"failures of {line}"[:160] for line in why[:4]]
+    table = printed(result_table(lines)[["task", "method", "n", "SR % [95 %]", "CMR % [95 %]"]])
+    room = MOST_LINES - 1 - len(parts)
+    rows = table.splitlines()
+    return "\n".join([*parts, "", *(rows if len(rows) <= room else rows[:0])]).rstrip()
 
 
 def _sections(
@@ -282,6 +311,7 @@ def _sections(
     """The paragraphs of report.md behind its title."""
     several = "s" if len(runs.manifests) > 1 else ""
     asked = f"{runs.wanted['asked'].sum()} episodes that {len(runs.manifests)} run{several}"
+    yield "\n".join(f"- {line}" for line in findings(lines, compared))
     yield "\n".join(
         [
             f"{len(runs.table)} of the {asked} asked for.",
@@ -289,7 +319,12 @@ def _sections(
             *(f"**Not alike**: {line}" for line in runs.unlike),
         ]
     )
-    yield from _results_section(lines, paper_results(runs))
+    yield from ("## Results", RESULTS_NOTE)
+    for (suite, split), part in lines.groupby(TRACK, sort=False):
+        yield f"### {track_title(str(suite), str(split))}"
+        yield printed(result_table(part), "markdown")
+        if suite == "tabletop":
+            yield paper.real_arm()
     yield from ("## Outcomes", printed(outcome_table(ends), "markdown"))
     tracebacks = [f"- {line}" for line in errors(runs)]
     if tracebacks:
@@ -366,39 +401,28 @@ def differences(compared: "pd.DataFrame", line: str = "task") -> "Figure":
     )
 
 
-def _results_section(lines: "pd.DataFrame", published: "pd.DataFrame") -> list[str]:
-    parts = ["## Results", RESULTS_NOTE]
-    for suite, of_suite in lines.groupby("suite", sort=False):
-        for (_, split), part in of_suite.groupby(TRACK, sort=False):
-            of_track = (published["suite"] == suite) & (published["split"] == split)
-            parts.append(f"### {track_title(str(suite), str(split))}")
-            parts.append(printed(result_table(part, published[of_track]), "markdown"))
-        notes = paper.footnotes(str(suite))
-        if suite == "tabletop":
-            notes = [paper.real_arm(), *notes]
-        if notes:
-            numbered = "\n".join(f"{i}. {note}" for i, note in enumerate(notes, 1))
-            parts.append(f"Footnotes to the paper's numbers:\n\n{numbered}")
-    return parts
-
-
-MOST_FAILURES = 24
-"""Failures that have a picture; the others are counted."""
-THUMBNAIL_PX = 150
+MOST_PICTURED, MOST_CARDS = 24, 400
+"""Failures that have pictures, and all that have a card; the others are counted."""
+PICTURE_PX = 300
 STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;max-width:1080px;margin:24px auto;padding:0 16px;
 color:#222;background:#fff}
 table{border-collapse:collapse;margin:12px 0}td,th{padding:3px 10px;text-align:left;
 border-bottom:1px solid #ddd;font-size:13px}th{border-bottom:2px solid #888}
-img{max-width:100%}.failures{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));
-gap:14px}.failures article{border:1px solid #ccc;border-radius:6px;padding:8px;font-size:13px}
-.failures img{width:31%;margin-right:1%}code{background:#f2f2f2;padding:1px 4px;font-size:12px}
-h3{font-size:14px;margin:6px 0 2px}.wide{overflow-x:auto}
+img{max-width:100%}.finding{font-size:19px}.failures article{border:1px solid #ccc;
+border-radius:6px;padding:8px 12px;margin:10px 0;font-size:13px}.failures img{width:300px;
+margin:4px 6px 0 0}code{background:#f2f2f2;padding:1px 4px;font-size:12px}
+h3{font-size:15px;margin:6px 0 2px}.wide{overflow-x:auto}[hidden]{display:none}select{font:inherit}
 """
+FILTER = """<script>
+const choose=()=>document.querySelectorAll('article').forEach(card=>card.hidden=
+[...document.querySelectorAll('select')].some(one=>one.value&&card.dataset[one.name]!==one.value));
+</script>"""
 
 
 def report_page(
     runs: Runs,
+    found: Sequence[str],
     tables: "Mapping[str, Mapping[str, pd.DataFrame]]",
     forest: "Figure",
     sources: Sequence[Path],
@@ -406,100 +430,109 @@ def report_page(
 ) -> str:
     """The page that stands in the folder `out`.
 
-    `tables` are the report's by section and title; `sources` are
-    the runs, whose recordings give the pictures of failures.
+    `found` are the findings, `tables` the report's by section and title; `sources` are the runs,
+    whose recordings give the pictures of failures.
     """
     table = runs.table
-    methods = ", ".join(dict.fromkeys(table["method"]))
-    won = int(table["outcome"].eq("success").sum())
-    about = f"{number_of(len(table), 'episode')}, {won} of them successes; methods: {methods}."
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Report</title>",
         f"<style>{STYLE}</style></head><body><h1>Report</h1>",
-        f"<p>{escape(about)}</p>",
+        *(f"<p class='finding'>{escape(line)}</p>" for line in found),
         *(f"<p><strong>Unfinished</strong>: {escape(line)}</p>" for line in runs.unfinished),
         _picture(forest, "success rates with 95 % intervals"),
     ]
+    if set(DIAGNOSIS_COLUMNS) <= set(table.columns):
+        parts += _failures(table, sources, out)
+        parts.append("<h2>Where episodes are lost</h2>")
+        funnel = charts.funnel(funnel_table(table))
+        parts.append(_picture(funnel, "episodes that are left after each stage"))
     for section, by_title in tables.items():
         parts.append(f"<h2>{escape(section)}</h2>")
         for title, shown in by_title.items():
             parts += [f"<h3>{escape(title)}</h3>"] if title else []
-            parts.append(printed(shown, "html"))
-    if set(DIAGNOSIS_COLUMNS) <= set(table.columns):
-        parts.append("<h2>Where episodes are lost</h2>")
-        funnel = charts.funnel(funnel_table(table))
-        parts.append(_picture(funnel, "episodes that are left after each stage"))
-        parts += _failures(table, sources, out)
+            parts.append(f"<div class='wide'>{printed(shown, 'html')}</div>")
     return "\n".join([*parts, "</body></html>\n"])
 
 
 def _failures(table: "pd.DataFrame", sources: Sequence[Path], out: Path) -> list[str]:
-    """A card per failure: its verdict, what the policy saw at the deciding frame, a link.
+    """A card per failure, to be chosen by case and task.
 
     Failures that were not diagnosed have none and are counted.
     """
     known = diagnosed(table)
     order = ["suite", "case", "sub_case", "method", "task", "episode"]
     failed = known[known["outcome"].eq("failure")].sort_values(order, kind="stable")
-    rows = failed.to_dict("records")
-    parts = [f"<h2>Failures ({len(rows)})</h2>"]
-    older = int(table["outcome"].eq("failure").sum()) - len(rows)
+    parts = [f"<h2>Failures ({len(failed)})</h2>"]
+    older = int(table["outcome"].eq("failure").sum()) - len(failed)
     if older:
         parts.append(f"<p>{older_text(older)}.</p>")
-    with closing(_recorded(rows, sources)) as recorded:
-        cards = [_card(row, path, out) for row, path in islice(recorded, MOST_FAILURES)]
-    if cards:
-        parts.append(f"<div class='failures'>{''.join(cards)}</div>")
-    if len(rows) > len(cards):
-        parts.append(
-            f"<p>{len(rows) - len(cards)} more without a picture here: "
-            "<code>./vap diagnose RUN</code> lists all of them, and records what was "
-            "not recorded.</p>"
-        )
+    shown = failed.head(MOST_CARDS)
+    for name in ("case", "task"):
+        options = "".join(f"<option>{escape(each)}</option>" for each in shown[name].unique())
+        choice = f"<option value=''>every {name}</option>{options}"
+        parts.append(f"<select name='{name}' onchange='choose()'>{choice}</select>")
+    from tqdm import tqdm
+
+    cards: list[str] = []
+    n_pictured = 0
+    for row in tqdm(shown.to_dict("records"), "failures", delay=2.0, leave=False):
+        path = _recorded(row, sources) if n_pictured < MOST_PICTURED else None
+        n_pictured += path is not None
+        cards.append(_card(row, path, sources, out))
+    parts.append(f"{FILTER}<div class='failures'>{''.join(cards)}</div>")
+    if len(failed) > len(shown):
+        parts.append(f"<p>{len(failed) - len(shown)} more: ./vap diagnose RUN</p>")
     return parts
 
 
-def _recorded(
-    rows: Sequence[Mapping[str, Any]], sources: Sequence[Path]
-) -> Generator[tuple[Mapping[str, Any], Path]]:
-    """Each episode that has a recording, and the first such.
+def _recorded(row: Mapping[str, Any], sources: Sequence[Path]) -> Path | None:
+    """The first recording of an episode, None where it has none.
 
     Files of runs of other policies have the same name; one that is damaged, unfinished or of
     another episode is none.
     """
     from vap_core.recording import read_summary, recording_file_name
 
-    for row in rows:
-        name = recording_file_name(
-            row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
-        )
-        for source in sources:
-            path = Path(source) / "recordings" / name
-            with suppress(BadRecording):
-                if path.is_file() and not why_other(read_summary(path), row):
-                    yield row, path
-                    break
+    name = recording_file_name(
+        row["suite"], row["task"], int(row["episode"]), int(row["seed"]), row["method"]
+    )
+    for source in sources:
+        path = Path(source) / "recordings" / name
+        with suppress(BadRecording):
+            if path.is_file() and not why_other(read_summary(path), row):
+                return path
+    return None
 
 
-def _card(row: Mapping[str, Any], recording: Path, out: Path) -> str:
+def _card(
+    row: Mapping[str, Any], recording: Path | None, sources: Sequence[Path], out: Path
+) -> str:
+    """Why an episode failed, what the policy saw at the deciding frame, and how to open it."""
     frame = max(0, int(row["deciding_frame"]))
-    words = f"{row['case'].capitalize()} · {row['sub_case']}"
-    about = f"{row['suite']} · {row['task']} · episode {row['episode']} · {row['method']}"
-    link = quote(os.path.relpath(recording, out).replace(os.sep, "/"))
+    case, task = str(row["case"]), str(row["task"])
+    about = f"{row['suite']} · {task} · episode {row['episode']} · {row['method']}"
     shown = ""
-    try:
-        for camera, rgb in _views(recording, frame).items():
-            name = escape(camera)
-            shown += f"<img alt='{name}' title='{name}' src='{_jpeg(rgb)}'>"
-    except BaseException as error:  # decoders of a damaged file raise anything, or panic
-        if isinstance(error, KeyboardInterrupt | SystemExit):
-            raise
-        shown = f"<em>its pictures cannot be read ({escape(type(error).__name__)})</em>"
-    look = command("view", recording, "--frame", str(frame))
+    if recording is None:
+        where = f"episode = {row['episode']} and seed = {row['seed']}"
+        words = ["--suite", row["suite"], "--task", task, "--method", row["method"]]
+        look = command("diagnose", *sources, *words, "--where", where, "--open", "0")
+    else:
+        link = quote(os.path.relpath(recording, out).replace(os.sep, "/"))
+        try:
+            for camera, rgb in _views(recording, frame).items():
+                name = escape(camera)
+                shown += f"<img alt='{name}' title='{name}' src='{_jpeg(rgb)}'>"
+        except BaseException as error:  # decoders of a damaged file raise anything, or panic
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                raise
+            shown = f"<em>its pictures cannot be read ({escape(type(error).__name__)})</em>"
+        shown += f"<br><a href='{link}'>recording</a>, "
+        look = command("view", recording, "--frame", str(frame))
     return (
-        f"<article><h3>✗ {escape(words)}</h3><div>{escape(about)}</div>"
-        f"<div>{shown}</div><p>{escape(str(row['case_sentence']))}</p>"
-        f"<a href='{link}'>recording</a>, frame {frame}: <code>{escape(look)}</code></article>"
+        f"<article data-case='{escape(case)}' data-task='{escape(task)}'>"
+        f"<h3>{escape(f'{case.capitalize()} · {row["sub_case"]}: {row["case_sentence"]}')}</h3>"
+        f"<div>{escape(about)}</div><div>{shown}frame {frame}: <code>{escape(look)}</code></div>"
+        "</article>"
     )
 
 
@@ -522,7 +555,7 @@ def _jpeg(rgb: "Rgb") -> str:
     from PIL import Image
 
     image = Image.fromarray(rgb)
-    image.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+    image.thumbnail((PICTURE_PX, PICTURE_PX))
     data = BytesIO()
     image.save(data, "JPEG", quality=78)
     return _inline("jpeg", data)
@@ -544,32 +577,27 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
     Raises: BadOutput.
     """
     scores = ordered(score(table), study.tasks, study.methods)
-    summary, figure = folder / "summary.json", folder / "figure.png"
+    summary_path, figure = folder / "summary.json", folder / "figure.png"
     lines = [
         {**to_json(line), "seed": study.seed, "seeds": study.seeds}
         for line in scores.to_dict("records")
     ]
     with writing(folder, "conclude"):
-        write_atomic(summary, json.dumps(lines, indent=1).encode())
+        write_atomic(summary_path, json.dumps(lines, indent=1).encode())
         nothing = dict.fromkeys(("sr_layout_low", "sr_layout_high"), float("nan"))
         write_png(forest(scores.assign(**nothing)), figure)
-    text = [
-        results_table(scores),
-        *_totals(scores),
-        *_layouts_note(study, table, folder),
-        "",
-        "time per control step, ms by part:",
-        _times_table(scores, table),
-        "",
-    ]
-    written = f"wrote {summary}, {figure}"
+    runs = load_runs([folder])
+    parts = {
+        method: sum(step_times(part).values())
+        for method, part in table.groupby("method", sort=False)
+    }
+    times = ", ".join(f"{method} {ms:.0f} ms" for method, ms in parts.items())
+    text = [summary(runs, results(runs), compare(runs.table, runs.methods))]
+    text += ["", f"a control step takes: {times}", f"wrote {summary_path}, {figure}"]
     recordings = sorted((folder / "recordings").glob("*.rrd"))
     if recordings:
-        size_mb = sum(path.stat().st_size for path in recordings) / 1e6
-        written += f", {len(recordings)} recordings ({size_mb:.0f} MB) in {folder / 'recordings'}"
         prompted = next((path for path in recordings if ".vap." in path.name), recordings[0])
-        written += f"\nlook at one: {study.next_command('view', prompted)}"
-    text.append(written)
+        text.append(f"look at one: {study.next_command('view', prompted)}")
     if table["outcome"].eq("failure").any():
         text.append(f"why they failed: {study.next_command('diagnose', folder)}")
     text.append(f"tables, paired tests, a page: {study.next_command('report', folder)}")
@@ -605,50 +633,6 @@ def ordered(
     order = scores.assign(_task=list(map(places.index, names)))
     order["_method"] = scores["method"].map(list(methods).index)
     return scores.loc[order.sort_values(["_task", "_method"], kind="stable").index]
-
-
-def _totals(scores: "pd.DataFrame") -> list[str]:
-    """Success over all tasks of a track per method, where there are several."""
-    lines = []
-    for (suite, split, method), part in scores.groupby([*TRACK, "method"], sort=False):
-        if len(part) > 1:
-            total = rate(int(part["sr_k"].sum()), int(part["n"].sum()))
-            least = part.loc[part["sr"].idxmin()]
-            track = f"{suite} ({split})" if split else suite
-            lines.append(
-                f"{track} {method}: {total.k} of {total.n} succeed, SR {total}; least "
-                f"{least['task']} {rate_of(least)}"
-            )
-    return ["", *lines] if lines else []
-
-
-def _layouts_note(study: "Study", table: "pd.DataFrame", folder: Path) -> list[str]:
-    """That the intervals above count episodes whose layouts return; nothing where none does."""
-    placed = table[["split", "method"]].assign(layout=layout_names(table))
-    if not placed.duplicated().any():
-        return []
-    layouts = placed["layout"].nunique()
-    episodes = len(placed) // placed["method"].nunique()
-    report = study.next_command("report", folder)
-    text = (
-        f"{episodes} episodes a method on {layouts} layouts; for intervals over layouts: {report}"
-    )
-    return ["", text]
-
-
-def _times_table(scores: "pd.DataFrame", table: "pd.DataFrame") -> str:
-    """Milliseconds of one control step by part, one row per suite and method."""
-    lines = []
-    for suite, method in dict.fromkeys(zip(scores["suite"], scores["method"], strict=True)):
-        times = step_times(table[(table["suite"] == suite) & (table["method"] == method)])
-        about = {"suite": suite, "method": method}
-        lines.append({**about, **times, "total": sum(times.values())})
-    import pandas as pd
-
-    found = pd.DataFrame(lines)
-    parts = [*found.columns.drop(["suite", "method", "total"]), "total"]
-    found[parts] = found[parts].fillna(0.0).map("{:.1f}".format)
-    return printed(found[["suite", "method", *parts]])
 
 
 RULED = (

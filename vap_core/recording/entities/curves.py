@@ -193,14 +193,6 @@ def _send_track_scores(
         send_curve(rec, entity, frame_times(tracked), np.array(scores))
 
 
-OUTCOME_COLOURS = {"success": CAMERAS[2], "failure": CAMERAS[2], "error": CAMERAS[2]}
-GRASP_COLOURS = {
-    "free": (70, 78, 92),
-    "touches target": TARGET,
-    "holds target": TARGET,
-    "touches other": LOOKALIKES[0],
-    "holds other": LOOKALIKES[0],
-}
 SUBGOAL_COLOURS = (CAMERAS[1], CAMERAS[2])
 """Of sub-goals in turn: greys, which only frame what happens."""
 HOMEWARD = "way home"
@@ -210,42 +202,12 @@ LINE_CHARACTERS = 60
 """Longer events are broken into rows, so that the list never cuts them."""
 
 
-def log_status_styles(rec: rr.RecordingStream) -> None:
-    """The colours of both lanes."""
-    log_row(rec, "/vap/status/outcome", state_style(OUTCOME_COLOURS))
-    log_row(rec, "/vap/status/grasp", state_style(GRASP_COLOURS))
-
-
-def send_outcome(rec: rr.RecordingStream, first: Frame, status: str) -> None:
-    """The outcome over the whole lane: a state that starts at the last step has no width."""
-    columns = rr.StateChange.columns(state=[status])
-    rec.send_columns("/vap/status/outcome", frame_times([first]), columns)
-
-
 def grasp_state(frame: Frame, target: str) -> str:
     """What the gripper has to do with the objects at one step."""
     for verb, names in (("holds", frame.truth.held), ("touches", frame.truth.touched)):
         if names:
             return f"{verb} target" if target in names else f"{verb} other"
     return "free"
-
-
-def send_grasp_changes(
-    rec: rr.RecordingStream, frames: Sequence[Frame], target: str, before: str | None
-) -> str | None:
-    """Send only changes: a state lasts until the next. Returns the last state."""
-    changed = []
-    states = []
-    for frame in frames:
-        state = grasp_state(frame, target)
-        if state != before:
-            changed.append(frame)
-            states.append(state)
-            before = state
-    if changed:
-        columns = rr.StateChange.columns(state=states)
-        rec.send_columns("/vap/status/grasp", frame_times(changed), columns)
-    return before
 
 
 def send_subgoals(

@@ -293,7 +293,7 @@ def _empty_image(camera: Camera) -> np.ndarray:
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 LABEL_SHARES = 0.27, 0.08
-"""Width and height of an object's name, as shares of a picture's."""
+"""Width and height of an object's name, as shares of a picture's where there are several."""
 
 
 def send_outlines(
@@ -310,7 +310,11 @@ def send_outlines(
         images, lengths = [], []
         spots: list[tuple[float, float]] = []
         names: list[str] = []
-        room_x, room_y = LABEL_SHARES[0] * camera.width, LABEL_SHARES[1] * camera.height
+        zoom = min(len(frames[0].cameras), 2) / 2
+        room_x, room_y = (
+            zoom * LABEL_SHARES[0] * camera.width,
+            zoom * LABEL_SHARES[1] * camera.height,
+        )
         for frame in frames:
             owner, before = _empty_image(camera), len(names)
             for name, mask in frame.truth.masks.get(camera.name, {}).items():
@@ -319,14 +323,15 @@ def send_outlines(
                     owner |= mask.view(np.uint8) * np.uint8(classes.get(name, OTHER_CLASS))
                     names.append(name)
                     x0, y0, x1, y1 = box.tolist()
-                    x, y = (x0 + x1) / 2, y1 + 2
-                    if y1 > camera.height - room_y:
-                        y = y0 - room_y
-                    while any(
-                        abs(x - a) < room_x and abs(y - b) < room_y for a, b in spots[before:]
-                    ):
-                        y += room_y
-                    spots.append((x, y))
+                    x, taken = (x0 + x1) / 2, spots[before:]
+                    places = (y1 + 2, y0 - room_y, y1 + 2 + room_y)
+                    free = [
+                        y
+                        for y in places
+                        if y + room_y < camera.height
+                        and all(abs(x - a) > room_x or abs(y - b) > room_y for a, b in taken)
+                    ]
+                    spots.append((x, [*free, places[0]][0]))
             images.append(np.where(owner == 0, cv2.dilate(owner, CROSS), 0).astype(np.uint8))
             lengths.append(len(names) - before)
         entity = f"{image_root(camera.name)}/identity"
