@@ -68,6 +68,7 @@ def test_waves_are_disjoint_and_every_arm_has_the_same_episodes() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("short_episodes")
 def test_the_command_answers_in_a_sentence_with_a_page_and_two_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,7 +114,7 @@ def test_the_commands_told_at_the_end_find_the_suite_and_are_quoted(
     suites.benchmark.cache_clear()
     (tmp_path / "my desk").mkdir()
     file = tmp_path / "my desk" / "desk.py"
-    file.write_text(DOCUMENTED)
+    file.write_text(DOCUMENTED.replace("max_steps=60", "max_steps=4"))
     words = ("eval", "--suite", file, "--policy", "expert", "--episodes", 1, "--record", "none")
     out = tmp_path / "my desk" / "run"
     done = process(*words, "--workers", 1, "--out", out, cwd=tmp_path)
