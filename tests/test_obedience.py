@@ -1,6 +1,7 @@
 """Does a policy obey a tint: the sequential test, its error rates, and the real command."""
 
 import itertools
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +22,16 @@ def test_the_verdicts_of_a_look() -> None:
     assert verdict(0, 0, 60) == "does not obey"
 
 
+judged = cache(verdict)
+
+
 def study(rng: np.random.Generator, plain: float, tinted: float) -> str:
     lost = won = 0
     for k in range(1, LOOKS + 1):
         generic, oracle = rng.random(WAVE) < plain, rng.random(WAVE) < tinted
         lost += int((generic & ~oracle).sum())
         won += int((~generic & oracle).sum())
-        found = verdict(lost, won, k * WAVE)
+        found = judged(lost, won, k * WAVE)
         if found != "open":
             return found
     return "open"

@@ -123,16 +123,14 @@ def reference_shots(model: ObjectModel, n: int, seed: int) -> list[Shot]:
     azimuths = 2 * np.pi * np.arange(n) / n
     tints = rng.uniform(0.45, 0.75, (n, 1)) + rng.uniform(-0.04, 0.04, (n, 3))
     shots = []
-    for azimuth, (red, green, blue) in zip(rng.permutation(azimuths), tints, strict=True):
-        turn = rng.uniform(-0.2, 0.2)
-        elevation_deg = rng.uniform(18, 50)
+    for azimuth, (red, green, blue) in zip(rng.permutation(azimuths), tints.tolist(), strict=True):
         shot = Shot(
-            azimuth=float(azimuth + turn),
-            elevation=float(np.radians(elevation_deg)),
+            azimuth=float(azimuth + rng.uniform(-0.2, 0.2)),
+            elevation=float(np.radians(rng.uniform(18, 50))),
             fill=float(rng.uniform(0.52, 0.66)),
             lamp=float(rng.uniform(-1.2, 1.2)),
             bright=float(rng.uniform(0.5, 0.75)),
-            table=(float(red), float(green), float(blue)),
+            table=(red, green, blue),
         )
         shots.append(shot)
     return shots
@@ -160,7 +158,7 @@ def write_preview(model: ObjectModel, path: Path) -> None:
     """The object from its front, its side, its back and above, side by side. Raises: BadOutput."""
     shots = []
     for azimuth, elevation in ((0.0, 0.3), (np.pi / 2, 0.3), (np.pi, 0.3), (0.4, 1.2)):
-        shots.append(Shot(float(azimuth), elevation, fill=0.75))
+        shots.append(Shot(azimuth, elevation, fill=0.75))
     picture = np.concatenate(photograph(model, shots), axis=1)
     with writing(path, "preview", "choose another folder with --out"):
         Image.fromarray(picture).save(path)

@@ -130,9 +130,9 @@ def _is_odd(t: np.ndarray) -> np.ndarray:
 
 def _blend(share: np.ndarray, over: Srgb, under: Srgb) -> Image.Image:
     """A picture with `share` of the colour `over` and the rest of the colour `under`."""
-    weight = np.asarray(share, np.float64)[..., None]
-    pixels = weight * np.array(over) + (1 - weight) * np.array(under)
-    return Image.fromarray(np.rint(pixels).astype(np.uint8))
+    weight = np.asarray(share, np.float64)
+    mixed = [weight * o + (1 - weight) * u for o, u in zip(over, under, strict=True)]
+    return Image.merge("RGB", [Image.fromarray(np.rint(part).astype(np.uint8)) for part in mixed])
 
 
 GlyphPoint = tuple[Number, Number]
