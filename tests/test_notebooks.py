@@ -332,8 +332,11 @@ def test_a_recording_becomes_the_viewer_where_there_is_one(tmp_path: Path) -> No
 def test_pages_have_an_index_and_the_viewer_beside_them(tmp_path: Path) -> None:
     path = notebook(tmp_path)
     out = tmp_path / "html"
-    assert notebook_pages.write_pages(path.parent, out) == [out / "00_a.html"]
-    assert 'href="00_a.html">00 · A &lt;b&gt;</a>' in (out / "index.html").read_text()
+    notebook_pages.write_pages(path.parent, out)
+    assert "<title>00 · A" in (out / "00_a.html").read_text()
+    index = (out / "index.html").read_text()
+    assert 'href="00_a.html"><img alt="" src="data:image/png;base64,' in index
+    assert "<h2>00 · A &lt;b&gt;</h2>" in index
     assert (out / "viewer" / "re_viewer_bg.wasm").stat().st_size > 1_000_000
     with pytest.raises(BadOutput, match="choose another folder"):
         notebook_pages.write_pages(path.parent, path)

@@ -24,7 +24,7 @@ from vap_core.perception.boxes import crop, mask_box, mask_iou
 from vap_core.perception.protocols import Encoder
 from vap_core.perception.references import Box
 from vap_core.policies.scripted.expert import Expert
-from vap_core.prompt import PALETTE, Tint, choose_colours
+from vap_core.prompt import PALETTE, Tint
 from vap_core.rollout.loop import rollout
 from vap_core.rollout.running import expert_steps
 from vap_core.rollout.types import Episode, Frame
@@ -374,8 +374,10 @@ def marked_frames(row: EpisodeRow) -> dict[str, Rgb]:
     with open_row(row) as env:
         camera = env.cameras()[0]
         rgb = env.observe().images[camera.name]
-        target, *others = _alike(row, env.truth(masks=True).masks[camera.name])
+        masks = dict(env.truth(masks=True).masks[camera.name])
         start = hand_pixel(camera, pose_transform(base).apply(env.tcp_base()[:3, 3]))
+    target = masks.pop(row.target)
+    others = [masks[name] for name in masks if get_object(name).category == row.category]
     frames = {DEFAULT: Tint()(rgb, target, PALETTE[0], others)}
     for name in ("form", "opacity"):
         for arm, how in ABLATIONS[name].arms.items():
@@ -385,29 +387,6 @@ def marked_frames(row: EpisodeRow) -> dict[str, Rgb]:
                 frames[arm] = draw_arrow(rgb, target, PALETTE[0], start)
     around = _around([target, *others], ROUND_PX)
     return {arm: frame[around] for arm, frame in frames.items()}
-
-
-def tinted_frames(row: EpisodeRow) -> dict[str, Rgb]:
-    """The same frame without a tint, with the one chosen for it, and with red, by the tint.
-
-    Raises: UnknownName, as `open_row`.
-    """
-    with open_row(row) as env:
-        camera = env.cameras()[0].name
-        rgb = env.observe().images[camera]
-        target, *others = _alike(row, env.truth(masks=True).masks[camera])
-    (chosen,) = choose_colours(1, [(rgb, [target, *others])])
-    frames = {"no tint": rgb}
-    for label, colour in (("chosen", chosen), ("always", PALETTE[0])):
-        frames[f"{label}: {colour.name}"] = Tint()(rgb, target, colour, others)
-    around = _around([target, *others], ROUND_PX)
-    return {label: frame[around] for label, frame in frames.items()}
-
-
-def _alike(row: EpisodeRow, masks: Mapping[str, Mask]) -> list[Mask]:
-    """The target's mask, and those of the other objects of its category."""
-    names = [name for name in masks if get_object(name).category == row.category]
-    return [masks[row.target], *(masks[name] for name in names if name != row.target)]
 
 
 def run_episode(

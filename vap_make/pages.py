@@ -5,7 +5,7 @@
     python -m http.server --bind 127.0.0.1 --directory build/html
 
 A cell whose metadata name a `recording` becomes Rerun's viewer, for which the pages must be served;
-read from files they show the still picture alone. Cells whose source JupyterLab hides are folded.
+read from files they show the still picture alone. Set-up, long cells and assertions are folded.
 """
 
 import html
@@ -15,7 +15,7 @@ import re
 import shutil
 import sys
 from base64 import b64encode
-from functools import cache
+from functools import cache, partial
 from mimetypes import guess_type
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,6 +133,7 @@ HEADING_OR_NAMELESS = re.compile(
 """A heading of a page, or the words that nbconvert gives a picture without any."""
 OUT = Path("build/html")
 """Where pages are written; git ignores it."""
+SERVE = "python -m http.server --bind 127.0.0.1 --directory"
 WIDGET = "application/vnd.jupyter.widget-view+json"
 FOLDED = """\
 {%- extends 'lab/index.html.j2' -%}
@@ -140,20 +141,58 @@ FOLDED = """\
 {%- block html_head_js_mathjax -%}{%- endblock -%}
 {%- block html_head_js_mermaidjs -%}{%- endblock -%}
 {%- block input_group -%}
-{%- if cell.metadata.get('jupyter', {}).get('source_hidden') -%}
-<details class="folded"><summary>the assertions behind this</summary>{{ super() }}</details>
+{%- if cell.metadata.get('jupyter', {}).get('source_hidden') or 'plumbing' in cell.metadata.tags -%}
+<details class="folded"><summary>code</summary>{{ super() }}</details>
 {%- else -%}{{ super() }}{%- endif -%}
 {%- endblock -%}
 """
-"""The template of a page: JupyterLab's, with hidden sources folded and nothing from the network."""
+"""The template of a page: JupyterLab's, with sources folded and nothing from the network."""
 STYLE = """<link rel="icon" href="data:,"><style>
 .folded summary{margin:4px 0 4px 80px;color:#555;cursor:pointer;font-size:13px}
 iframe.recording{width:100%;height:720px;border:1px solid #ccc}
-main{max-width:1280px;margin:0 auto}
+main{max-width:1180px;margin:0 auto}
 .jp-RenderedHTMLCommon table{font-size:13px}
 .jp-InputArea pre,.jp-RenderedText pre{white-space:pre-wrap;word-break:normal;
 overflow-wrap:anywhere}
-</style>"""
+nav.outline{position:fixed;top:24px;left:16px;width:210px;font:13px/1.4 system-ui}
+nav.outline a{display:block;padding:3px 8px;color:#555;text-decoration:none;
+border-left:2px solid #ddd}
+nav.outline a:hover{color:#000;border-color:#555}
+@media (min-width:1000px){body.outlined main{margin-left:240px}}
+@media (max-width:999px){nav.outline{position:static;width:auto;margin:16px}}
+.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:20px;
+padding:24px;font:15px/1.45 system-ui;color:#222}
+.cards>*{grid-column:1/-1;margin:0}
+.cards .card{grid-column:auto;border:1px solid #ddd;border-radius:8px;overflow:hidden;color:inherit;
+text-decoration:none}
+.card:hover{border-color:#555}
+.card img{width:100%;height:190px;object-fit:cover;object-position:0 0;border-bottom:1px solid #eee}
+.card h2{font-size:17px;margin:12px 16px 4px}.card p{margin:0 16px 14px;color:#444}
+</style><script>
+addEventListener("DOMContentLoaded", () => {
+  const parts = [...document.querySelectorAll("main h2[id]")];
+  const outline = document.createElement("nav");
+  outline.className = "outline";
+  const index = outline.appendChild(document.createElement("a"));
+  index.href = "index.html";
+  index.textContent = "all notebooks";
+  for (const part of parts) {
+    const link = outline.appendChild(document.createElement("a"));
+    link.href = "#" + part.id;
+    link.textContent = part.textContent.replace("\u00b6", "");
+  }
+  if (parts.length) document.body.classList.add("outlined"), document.body.prepend(outline);
+});
+</script>"""
+CARD = """<a class="card" href="{page}"><img alt="" src="{picture}"><h2>{title}</h2>
+<p>{question}</p></a>
+"""
+"""A notebook in the index: the picture of its answer, its title and its question."""
+INDEX = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Notebooks</title>
+<meta name="viewport" content="width=device-width">{style}<main class="cards"><h1>Notebooks</h1>
+<p>One question each, answered by a picture, a table and the code that made them.</p>
+{cards}</main></html>
+"""
 VIEWER_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Recording</title>
 <link rel="stylesheet" href="widget.css">
 <style>html,body{margin:0;height:100%;background:#111;color:#ddd;font:15px system-ui}</style>
@@ -171,25 +210,27 @@ widget.render({model, el: document.getElementById("viewer")});
 """Rerun's notebook widget without a notebook: it opens the recording that the address names."""
 
 
-def write_pages(notebooks: Path, out: Path) -> list[Path]:
-    """Write a page per notebook, an index, and the viewer; returns the pages.
+def write_pages(notebooks: Path, out: Path) -> None:
+    """Write a page per notebook, an index, and the viewer.
 
     Raises: BadOutput where there is no notebook or `out` cannot be written; MissingPart.
     """
-    pages = []
-    listed = []
+    cards = ""
     with writing(out, "notebook_pages", "choose another folder"):
         _write_viewer(out / "viewer")
         for path in notebook_files(notebooks):
-            page = out / f"{path.stem}.html"
-            write_atomic(page, page_of(path, out).encode())
-            pages.append(page)
-            title = notebook_title(read_notebook(path))
-            listed.append(f'<li><a href="{page.name}">{html.escape(title)}</a></li>')
-        index = f"<!doctype html><meta charset='utf-8'><title>Notebooks</title>{STYLE}"
-        index += f"<main><h1>Notebooks</h1><ul>{''.join(listed)}</ul></main>\n"
-        write_atomic(out / "index.html", index.encode())
-    return pages
+            page = f"{path.stem}.html"
+            write_atomic(out / page, page_of(path, out).encode())
+            shown = read_notebook(path)
+            picture = re.search(r"!\[.*?\]\((.+?)\)", "".join(shown["cells"][0]["source"]))
+            card = CARD.format(
+                page=page,
+                picture=picture[1] if picture else "data:,",
+                title=html.escape(notebook_title(shown)),
+                question=html.escape(question(shown).replace("*", "")),
+            )
+            cards += re.sub(PICTURE, partial(_embedded, path=path), card)
+        write_atomic(out / "index.html", INDEX.format(style=STYLE, cards=cards).encode())
 
 
 def page_of(path: Path, out: Path) -> str:
@@ -216,7 +257,7 @@ def page_of(path: Path, out: Path) -> str:
     body = re.sub(r"<title>.*?</title>", lambda _: f"<title>{title}</title>", body, count=1)
     body = body.replace("</head>", f"{STYLE}</head>", 1)
     body = _name_pictures(body)
-    body = re.sub(r'src="(\.\./[^":]+)"', lambda picture: _embedded(picture, path), body)
+    body = re.sub(PICTURE, partial(_embedded, path=path), body)
     return re.sub(r'href="([^"#:]+)(#[^"]*)?"', lambda link: _link(link, path, out), body)
 
 
@@ -262,6 +303,9 @@ def _name_pictures(body: str) -> str:
     return HEADING_OR_NAMELESS.sub(named, body)
 
 
+PICTURE = r'src="(\.\./[^":]+)"'
+
+
 def _embedded(picture: re.Match[str], path: Path) -> str:
     """A picture of another folder, inside the page; nbconvert embeds those beside a notebook."""
     file = path.parent / picture[1]
@@ -282,7 +326,7 @@ def _viewer_output(recording: Path, out: Path) -> "NotebookNode":
         text = (
             f'<iframe class="recording" src="{where}" title="recording"></iframe>'
             f'<p><a href="{where}">the recording alone</a>; the viewer needs this folder served: '
-            f"<code>python -m http.server --bind 127.0.0.1 --directory {out}</code></p>"
+            f"<code>{SERVE} {out}</code></p>"
         )
     else:
         text = "<p><em>Run this notebook, then <code>make html</code>, for the viewer.</em></p>"
@@ -320,13 +364,10 @@ def _write_viewer(folder: Path) -> None:
 def main() -> None:
     """Write the links in ./notebooks, or their pages."""
     if sys.argv[1:] == ["links"]:
-        for path in write_links(Path("notebooks")):
-            print(f"links of {path}")
+        print("links of", *write_links(Path("notebooks")))
         return
-    for page in write_pages(Path("notebooks"), OUT):
-        print(page)
-    serve = f"python -m http.server --bind 127.0.0.1 --directory {OUT}"
-    print(f"open {OUT}/index.html; for the viewer: {serve}")
+    write_pages(Path("notebooks"), OUT)
+    print(f"open {OUT}/index.html; for the viewer: {SERVE} {OUT}")
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ class Learner(nn.Module):
 
     The embeddings of words are not: a word means the same to a policy that begins with a
     mini-PaliGemma and to that model, in which a soft prompt learns its word. Trainings of before
-    the recipe moved them (docs/policies.md); what goes on from such a policy keeps them as they are.
+    the recipe moved them (docs/policies.md); what goes on from such a policy keeps them.
     """
 
     def __init__(self, config: MiniPI0Config) -> None:
