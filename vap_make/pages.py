@@ -27,8 +27,6 @@ from vap_core.base.files import parse_json, write_atomic, writing
 if TYPE_CHECKING:
     from nbformat import NotebookNode
 
-MAP_NOTEBOOK = "00"
-"""The number of the notebook that holds the map."""
 MAP_ID, TOP_ID, END_ID = "all-notebooks", "links-top", "links-end"
 """The ids of the cells that are written here."""
 MAP_HEADING = "All notebooks"
@@ -65,14 +63,16 @@ def question(notebook: dict[str, Any]) -> str:
 
 
 def links_text(path: Path, titles: dict[Path, str]) -> str:
-    """The line that leads from `path` to its neighbours and to the map; `titles` are in order."""
+    """The line that leads from `path` to its neighbours and to the map, which the first one holds;
+    `titles` are in order.
+    """
     paths = list(titles)
     at = paths.index(path)
     parts = []
     if at > 0:
         parts.append(f"← [{titles[paths[at - 1]]}]({paths[at - 1].name})")
     anchor = MAP_HEADING.replace(" ", "-")
-    parts.append(f"[{MAP_HEADING.lower()}]({_map_file(paths).name}#{anchor})")
+    parts.append(f"[{MAP_HEADING.lower()}]({paths[0].name}#{anchor})")
     if at + 1 < len(paths):
         parts.append(f"[{titles[paths[at + 1]]}]({paths[at + 1].name}) →")
     return " · ".join(parts)
@@ -100,7 +100,7 @@ def write_links(folder: Path) -> list[Path]:
         before = json.dumps(notebook)
         text = links_text(path, titles)
         _put_cell(notebook["cells"], TOP_ID, text, at=1)
-        if path == _map_file(list(notebooks)):
+        if path == next(iter(notebooks)):
             _put_cell(notebook["cells"], MAP_ID, table, at=len(notebook["cells"]))
         _put_cell(notebook["cells"], END_ID, text, at=len(notebook["cells"]))
         if json.dumps(notebook) != before:
@@ -108,10 +108,6 @@ def write_links(folder: Path) -> list[Path]:
             write_atomic(path, data.encode())
             changed.append(path)
     return changed
-
-
-def _map_file(paths: list[Path]) -> Path:
-    return next((path for path in paths if path.name.startswith(MAP_NOTEBOOK)), paths[0])
 
 
 def _put_cell(cells: list[dict[str, Any]], name: str, text: str, at: int) -> None:
