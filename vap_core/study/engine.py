@@ -217,8 +217,9 @@ def run_job(job: Job) -> Rows:
         policy_timeout_s=job.policy_timeout_s,
     )
     with unchanged_weights(trial.policy) as checksum:
-        batch = BATCH if isinstance(trial.scene, Scene) else 1  # other libraries' take memory
-        episodes = list(rollout(trial, job.rows, begin, batch=batch))
+        # Other libraries' environments take memory: one at a time.
+        groups = [job.rows] if isinstance(trial.scene, Scene) else [[row] for row in job.rows]
+        episodes = [each for rows in groups for each in rollout(trial, rows, begin, batch=BATCH)]
     steps.write(job.folder, episodes)
     logs.write_states(job.folder, episodes)
     logs.write_audit(job.folder, episodes)
