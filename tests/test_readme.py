@@ -115,3 +115,15 @@ def test_what_shared_scenes_reach() -> None:
     assert f"{of_way(desk, 'vap').replace(' [', ' % [')} of {len(desk)} on the desk" in PROSE
     pair = of_vap[of_vap.policy.str.contains("shared-pair@")]
     assert f"pairs {of_way(pair, 'vap').replace(' [', ' % [')} of {len(pair)}" in PROSE
+
+
+def test_what_libero_reaches() -> None:
+    found = results(load_runs([RESULTS / "libero.parquet"]))
+    cells = []
+    for line in found[found.task == ALL_TASKS].itertuples():
+        assert (line.n, line.errors) == (33, 0)
+        success = in_percent(Estimate(line.sr, line.sr_low, line.sr_high, 33))
+        wrong = Estimate(line.wrong_object, line.wrong_object_low, line.wrong_object_high, 33)
+        cells.append([line.method, f"{success} of 33", in_percent(wrong)])
+    _, *rows = table("| method | success, % |")
+    assert sorted([method_of(name), *rest] for name, *rest in rows) == sorted(cells)
