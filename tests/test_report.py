@@ -104,8 +104,8 @@ def test_a_tiny_run_is_reported_to_the_letter(tmp_path: Path) -> None:
     folder, out = run(tmp_path / "run"), tmp_path / "out"
     shown = report([folder], out).splitlines()
     assert shown[0] == (
-        "simpler-bridge (scripted): vap 50.0 % of 12, generic 33.3 % of 12; "
-        "vap - generic: +16.7 [+0.0, +50.0] points, p 0.500"
+        "simpler-bridge: vap succeeds in 50.0 % of 12, generic in 33.3 % of 12; "
+        "vap - generic: +16.7 [+0.0, +50.0] points, p 0.500 (scripted)"
     )
     assert len(shown) <= 18
     assert plain((out / "report.md").read_text(), folder) == GOLDEN.read_text()
@@ -296,7 +296,7 @@ def test_the_end_of_a_run_is_at_most_twenty_lines_and_opens_with_the_finding(
     study = Study(BRIDGE, ("generic", "vap"), episodes=6, policy="scripted")
     folder = run(tmp_path / "run")
     said = conclude(study, load_runs([folder]).table, folder).splitlines()
-    assert said[0].startswith("simpler-bridge (scripted): vap 50.0 % of 12, generic 33.3 % of 12;")
+    assert said[0].startswith("simpler-bridge: vap succeeds in 50.0 % of 12, generic in 33.3 %")
     assert len(said) <= 20
     assert any(line.startswith("errors: 2 x RuntimeError") for line in said)
     assert any(line.startswith("| all tasks") or "all tasks" in line for line in said)
@@ -474,7 +474,7 @@ def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     folder = run(tmp_path / "run")
     done = vap("report", folder)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("simpler-bridge (scripted): vap 50.0 %")
+    assert done.stdout.startswith("simpler-bridge: vap succeeds in 50.0 %")
     assert len(done.stdout.splitlines()) <= 20
     (folder / "run.json").unlink()
     refused = vap("report", folder)

@@ -100,22 +100,29 @@ class Terminal:
 
 
 def tell(thread: int) -> None:
-    """Say in longer and longer intervals, while no bar moves, which function runs, and how long."""
+    """Keep the clocks of bars moving; without one say in longer and longer intervals which
+    functions run, and how long.
+    """
     from tqdm import tqdm
 
-    seconds = PATIENCE_S
-    time.sleep(seconds)
+    start, wait_s = time.monotonic(), PATIENCE_S
     while True:
+        time.sleep(1.0)
+        bars = list(tqdm._instances)
+        for bar in bars:
+            bar.refresh()
+        seconds = time.monotonic() - start
+        if bars or seconds < wait_s:
+            continue
         codes = [frame.f_code for frame, _ in walk_stack(sys._current_frames()[thread])]
         names = [
-            code.co_name.replace("_", " ")
+            code.co_name.strip("_").replace("_", " ")
             for code in codes
             if re.search("vap_core/(?!cli)", code.co_filename) and code.co_name.isidentifier()
         ]
-        if names and not tqdm._instances:
-            print(f"{sys.argv[1]}: {names[-1].strip()}, {seconds:.0f} s so far", file=sys.stderr)
-        time.sleep(seconds)
-        seconds *= 2
+        told = ", ".join([sys.argv[1], *reversed(names[-2:])])
+        print(f"{told}: {seconds:.0f} s so far", file=sys.stderr)
+        wait_s *= 2
 
 
 def main() -> None:

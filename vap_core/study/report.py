@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -273,14 +274,15 @@ def findings(lines: "pd.DataFrame", compared: "pd.DataFrame") -> list[str]:
     for (suite, split, policy), part in lines.groupby(by, sort=False):
         whole = part[part["task"].eq(part["task"].iloc[-1])]  # all tasks, where there are several
         ranked = whole.sort_values("sr", ascending=False, kind="stable").to_dict("records")
-        rates = (f"{line['method']} {percent(line['sr'])} % of {line['n']}" for line in ranked)
-        text = f"{track_title(str(suite), str(split))} ({policy}): {', '.join(rates)}"
+        rates = [f"{line['method']} in {percent(line['sr'])} % of {line['n']}" for line in ranked]
+        rates[0] = rates[0].replace(" in ", " succeeds in ")
+        text = f"{track_title(str(suite), str(split))}: {', '.join(rates)}"
         same = whole[[*by, "task", "method"]].rename(columns={"method": "one"}).head(1)
         pairs = compared.merge(same).sort_values("difference", ascending=False).head(1)
         for pair in pairs.itertuples():
             points = points_text(pair, digits=1)
             text += f"; {pair.other} - {pair.one}: {points} points, p {p_text(pair.p)}"
-        found.append(text)
+        found.append(f"{text} ({policy})")
     return found
 
 
@@ -511,6 +513,8 @@ def _card(
     frame = max(0, int(row["deciding_frame"]))
     case, task = str(row["case"]), str(row["task"])
     about = f"{row['suite']} · {task} · episode {row['episode']} · {row['method']}"
+    why = re.sub(r"[\w-]+-lookalike-", "look-alike ", str(row["case_sentence"]))
+    why = re.sub(r"[\w-]+-personal\b", "yours", why)
     shown = ""
     if recording is None:
         where = f"episode = {row['episode']} and seed = {row['seed']}"
@@ -530,7 +534,7 @@ def _card(
         look = command("view", recording, "--frame", str(frame))
     return (
         f"<article data-case='{escape(case)}' data-task='{escape(task)}'>"
-        f"<h3>{escape(f'{case.capitalize()} · {row["sub_case"]}: {row["case_sentence"]}')}</h3>"
+        f"<h3>{escape(f'{case.capitalize()} · {row["sub_case"]}: {why}')}</h3>"
         f"<div>{escape(about)}</div><div>{shown}frame {frame}: <code>{escape(look)}</code></div>"
         "</article>"
     )
