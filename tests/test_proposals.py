@@ -192,13 +192,9 @@ def test_references_that_agree_ask_for_more_but_not_for_their_own_agreement(
 
 def test_recordings_and_signals_say_not_in_view() -> None:
     from vap_core.base.pictures import result_line
-    from vap_core.recording.texts import describe_vote
 
     _, attended = Attender(STRICT, {"mug": MUG}).start({"front": UNLIKE}, "bring my cup")
     (grounding,) = attended.groundings["front"]
-    said = describe_vote(grounding)
-    assert said.startswith("#0 not in view, cosine ")
-    assert said.endswith(" below 0.99 · best of the vote: votes 3 of 3, the only candidate")
     assert result_line(grounding).startswith("#0 not in view, cosine ")
 
 

@@ -23,9 +23,9 @@ from tests.drawn import (
     record,
     rerun,
 )
+from vap_core.base.pictures import result_line
 from vap_core.base.types import Association, PersonalObject, Track
 from vap_core.recording import Recorder, read_summary, record_grounding, recording_name
-from vap_core.recording.texts import describe_vote
 from vap_core.rollout.types import EpisodeHeader, Frame
 from vap_core.study.diagnosis import explain
 
@@ -201,11 +201,11 @@ def test_what_the_views_agreed_on_can_be_read_back(tmp_path: Path) -> None:
         "support_side": [1.0, 2.0, -1.0, 3.25],
     }
     assert columns(tmp_path / "one.rrd", "/vap/association", "cameras")[0] == ["front", "side"]
-    assert describe_vote(groundings["front"][0]).startswith(
-        "#1 is chosen · #0 wins: votes 4 of 5, lead +0.12"
+    assert result_line(groundings["front"][0]).startswith(
+        "#1 is chosen, against the vote for #0: votes 4 of 5, lead +0.12"
     )
-    assert describe_vote(groundings["side"][0]).startswith(
-        "none is chosen · #0 wins: votes 4 of 5, lead +0.12"
+    assert result_line(groundings["side"][0]).startswith(
+        "none is chosen, against the vote for #0: votes 4 of 5, lead +0.12"
     )
     assert "/vap/votes/side/winner" not in entities(tmp_path / "one.rrd")
     assert rerun("rrd", "verify", tmp_path / "one.rrd").returncode == 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import rerun as rr
@@ -20,7 +21,7 @@ from vap_core.base.types import (
 from vap_core.recording.colours import image_root
 from vap_core.recording.entities.curves import send_events
 from vap_core.recording.entities.pictures import CLASSES, encode_jpeg, jpeg_image, track_image
-from vap_core.recording.entities.votes import log_vote, log_vote_picture
+from vap_core.recording.entities.votes import log_vote
 from vap_core.recording.layout import (
     Part,
     events_view,
@@ -74,23 +75,21 @@ class ClipStep:
     track: Track
 
 
-class ClipRecorder:
-    """Streams the frames of a clip to disk; `ground` adds the vote that started the track.
+class Streamed:
+    """A recording that is streamed to disk.
 
     Left through an exception, the unfinished file keeps its temporary name.
 
     Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
 
-    def __init__(self, path: Path, camera: str, name: str, hz: float = 1.0) -> None:
+    def __init__(self, path: Path, recording_id: str, name: str) -> None:
         self.path = Path(path)
-        self._hz = hz
-        self._camera = camera
-        self._rec = open_stream(self.path, f"ground.{name}.{camera}.{self.path.stem}")
-        self._rec.send_recording_name(f"ground · {name}")
+        self._rec = open_stream(self.path, recording_id)
+        self._rec.send_recording_name(name)
         log_row(self._rec, "/", rr.AnnotationContext(CLASSES))
 
-    def __enter__(self) -> "ClipRecorder":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -98,6 +97,16 @@ class ClipRecorder:
             finish_stream(self._rec, self.path)
         else:
             self._rec.disconnect()
+
+
+class ClipRecorder(Streamed):
+    """Streams the frames of a clip; `ground` adds the vote that started the track."""
+
+    def __init__(self, path: Path, camera: str, name: str, hz: float = 1.0) -> None:
+        recording_id = f"ground.{name}.{camera}.{Path(path).stem}"
+        super().__init__(path, recording_id, f"ground · {name}")
+        self._hz = hz
+        self._camera = camera
 
     def add(self, step: ClipStep) -> None:
         """One frame, its prompted picture, its mask and the track's score."""
@@ -115,10 +124,7 @@ class ClipRecorder:
     ) -> None:
         """The vote of one frame, its references and similarities, and how it is looked at."""
         at = time_columns([(frame_index, timestamp_s)])
-        log_vote(self._rec, grounding, 0, encode_jpeg(image, JPEG_QUALITY), at)
-        log_vote_picture(
-            self._rec, grounding, 0, rgb=image, references=obj.crops, yours=None, at=at
-        )
+        log_vote(self._rec, grounding, 0, image, obj.crops, at)
         document = grounding_document(grounding, obj, instruction, rewritten)
         log_row(self._rec, "/vap/instruction", document, at=at)
         grounding_blueprint(grounding, self._hz).send(self._rec)
@@ -138,34 +144,18 @@ def log_clip_step(rec: rr.RecordingStream, camera: str, step: ClipStep) -> None:
     log_row(rec, f"/vap/track_score/{camera}", rr.Scalars([step.track.score]), at=at)
 
 
-class DatasetRecorder:
-    """Streams the frames of an episode to disk; `ground` adds the votes that began the tracks.
+class DatasetRecorder(Streamed):
+    """Streams the frames of an episode; `ground` adds the votes that began the tracks.
 
     `served`: of an episode behind the proxy, which has actions and events.
-
-    Left through an exception, the unfinished file keeps its temporary name.
-
-    Raises: BadOutput, when `path` exists or its folder cannot be written.
     """
 
     def __init__(
         self, path: Path, cameras: Sequence[str], name: str, hz: float, *, served: bool = False
     ) -> None:
-        self.path = path
-        self._rec = open_stream(path, f"dataset.{name}.{path.stem}")
-        self._rec.send_recording_name(f"{path.stem} · {name}")
-        log_row(self._rec, "/", rr.AnnotationContext(CLASSES))
+        super().__init__(path, f"dataset.{name}.{path.stem}", f"{path.stem} · {name}")
         further = [events_view(), rrb.TimeSeriesView(origin="/action", name="action")]
         dataset_blueprint(cameras, hz, further if served else ()).send(self._rec)
-
-    def __enter__(self) -> "DatasetRecorder":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            finish_stream(self._rec, self.path)
-        else:
-            self._rec.disconnect()
 
     def add(self, frame_index: int, at_s: float, views: Views, attended: Attended) -> None:
         """One frame of every camera, with the first target's track."""
@@ -196,10 +186,7 @@ class DatasetRecorder:
         at = time_columns([(0, 0.0)])
         for i, (camera, rgb) in enumerate(views.items()):
             grounding = attended.groundings[camera][0]
-            log_vote(self._rec, grounding, 0, encode_jpeg(rgb, JPEG_QUALITY), at)
-            log_vote_picture(
-                self._rec, grounding, 0, rgb=rgb, references=obj.crops, yours=None, at=at
-            )
+            log_vote(self._rec, grounding, 0, rgb, obj.crops, at)
             if i == 0:
                 document = grounding_document(grounding, obj, told, attended.text)
                 log_row(self._rec, "/vap/instruction", document, at=at)

@@ -10,7 +10,6 @@ import rerun.blueprint as rrb
 from vap_core.base.types import Grounding, value
 from vap_core.recording.colours import BACKGROUND, image_root, target_suffix
 from vap_core.recording.entities.scene import mean_placement
-from vap_core.recording.entities.votes import vote_picture_entity
 from vap_core.recording.stream import StoredBlueprint
 from vap_core.rollout.types import Diagnosis, EpisodeHeader
 
@@ -71,7 +70,7 @@ def attention_view(camera: str, query: str) -> Part:
 def vote_picture_view(camera: str) -> Part:
     """The candidates, the reference photos, and the cosines that were compared."""
     return rrb.Spatial2DView(
-        origin=vote_picture_entity(camera), name=f"{camera} · vote", background=BACKGROUND
+        origin=f"/vap/vote_picture/{camera}", name=f"{camera} · vote", background=BACKGROUND
     )
 
 

@@ -64,7 +64,6 @@ from vap_core.recording.entities.scene import (
 from vap_core.recording.entities.votes import (
     log_association,
     log_vote,
-    log_vote_picture,
     mean_cosines,
 )
 from vap_core.recording.layout import Axes, episode_blueprint
@@ -249,18 +248,16 @@ class Recorder:
         rec = self._open_stream()
         at = frame_times([frame])
         rgb = frame.images[camera]
-        jpeg = encode_jpeg(rgb, JPEG_QUALITY)
         groundings = self._goal.groundings.get(camera, ())
         if not groundings:
-            log_row(rec, f"{image_root(camera)}/candidates", jpeg_image(jpeg), at=at)
-            return
+            jpeg = jpeg_image(encode_jpeg(rgb, JPEG_QUALITY))
+            log_row(rec, f"{image_root(camera)}/candidates", jpeg, at=at)
         for j, grounding in enumerate(groundings):
             yours = None
             if j == 0 and frame.truth.masks.get(camera):
                 yours = _right_candidate(grounding, frame.truth.masks[camera], self._goal)
             references = self._header.references.get(grounding.object, ())
-            log_vote(rec, grounding, j, jpeg, at, yours, again)
-            log_vote_picture(rec, grounding, j, rgb, references, yours, at)
+            log_vote(rec, grounding, j, rgb, references, at, yours, again)
 
     def _flush(self) -> None:
         """Send the buffered frames as columns and write them to the file."""

@@ -1,28 +1,11 @@
-"""Text in a recording: the vote of a view, the outcome, the diagnosis, the instruction pane."""
+"""Text in a recording: the outcome, the diagnosis, the instruction pane."""
 
 import rerun as rr
 
-from vap_core.base.events import describe_ballot, describe_rejection
-from vap_core.base.pictures import LEGEND, object_labels
+from vap_core.base.pictures import LEGEND, object_labels, result_line
 from vap_core.base.types import Grounding, PersonalObject
 from vap_core.rollout.types import Diagnosis, EpisodeHeader
 from vap_core.simulation.types import EpisodeRow, Outcome
-
-
-def describe_vote(grounding: Grounding) -> str:
-    """One view's vote in a line; before it what was chosen instead."""
-    ballot = grounding.ballot
-    if ballot.winner is None:
-        return "no candidate, view unmodified"
-    if grounding.rejected is not None:
-        rejection = f"#{grounding.rejected} {describe_rejection(grounding)}"
-        return f"{rejection} · best of the vote: {describe_ballot(grounding)}"
-    text = f"#{ballot.winner} wins: {describe_ballot(grounding)}"
-    if not grounding.overruled:
-        return text
-    if grounding.winner is None:
-        return f"none is chosen · {text}"
-    return f"#{grounding.winner} is chosen · {text}"
 
 
 def describe_outcome(outcome: Outcome) -> str:
@@ -125,7 +108,7 @@ def grounding_document(
     lines = [
         f'**said** "{instruction}"',
         f'**policy reads** "{rewritten}"',
-        describe_vote(grounding),
+        result_line(grounding),
         f"{obj.name} · {obj.category} · {len(obj.crops)} references · {obj.encoder}",
     ]
     return _markdown("\n\n".join(lines))

@@ -10,7 +10,7 @@ from vap_core.base.events import describe_ballot
 from vap_core.base.pictures import RIGHT_MARK, WRONG_MARK, Rgb8, vote_picture
 from vap_core.base.types import Association, Grounding, Rgb
 from vap_core.recording.colours import ELECTED, MUTED, image_root, target_suffix
-from vap_core.recording.entities.pictures import encode_jpeg, jpeg_image
+from vap_core.recording.entities.pictures import JPEG_QUALITY, encode_jpeg, jpeg_image
 from vap_core.recording.stream import log_row
 
 type Rect = tuple[float, float, float, float]
@@ -99,12 +99,13 @@ def log_vote(
     rec: rr.RecordingStream,
     grounding: Grounding,
     j: int,
-    jpeg: np.ndarray | None,
+    rgb: Rgb,
+    references: Sequence[Rgb],
     at: Sequence[rr.TimeColumn],
     yours: int | None = None,
     again: bool = False,
 ) -> None:
-    """The vote of target j in one view: labelled boxes over the picture, and numbers.
+    """The vote of target j in one view: labelled boxes over its picture, a picture, numbers.
 
     `yours` is the candidate that is the target, -1 where none is, None where that is unknown.
     Where it is held `again`, for another sub-goal, a vote without candidates takes the boxes of
@@ -113,8 +114,9 @@ def log_vote(
     name = f"{grounding.camera}{target_suffix(j)}"
     order = _drawing_order(grounding)
     entity = f"{image_root(grounding.camera)}/candidates{target_suffix(j)}"
-    if jpeg is not None:
-        log_row(rec, entity, jpeg_image(jpeg), at=at)
+    drawn = vote_picture(grounding, rgb, references, yours=yours)
+    for where, picture in ((entity, rgb), (f"/vap/vote_picture/{name}", drawn)):
+        log_row(rec, where, jpeg_image(encode_jpeg(picture, JPEG_QUALITY)), at=at)
     if order:
         _log_boxes(rec, entity, grounding, order, at, yours)
         counts = rr.AnyValues(counts=grounding.ballot.votes)
@@ -264,26 +266,3 @@ def _candidate_numbers(grounding: Grounding) -> rr.AnyValues:
 
 def _number(candidate: int | None) -> np.int64:
     return np.int64(-1 if candidate is None else candidate)
-
-
-JPEG_QUALITY = 88
-
-
-def vote_picture_entity(camera: str, j: int = 0) -> str:
-    """The entity of the vote's picture of target j in one view."""
-    return f"/vap/vote_picture/{camera}{target_suffix(j)}"
-
-
-def log_vote_picture(
-    rec: rr.RecordingStream,
-    grounding: Grounding,
-    j: int,
-    rgb: Rgb,
-    references: Sequence[Rgb],
-    yours: int | None,
-    at: Sequence[rr.TimeColumn],
-) -> None:
-    """The vote of target j; `yours` as in `log_vote`."""
-    picture = vote_picture(grounding, rgb, references, yours=yours)
-    jpeg = jpeg_image(encode_jpeg(picture, JPEG_QUALITY))
-    log_row(rec, vote_picture_entity(grounding.camera, j), jpeg, at=at)
