@@ -78,7 +78,7 @@ def test_view_names_the_mend_of_a_leftover_and_makes_a_recording_of_it(
     for words in (("view", leftover), ("view", leftover, "--png", tmp_path / "a.png")):
         message = refused(*words)
         assert "is a recording that was not finished" in message
-        assert f"vap_core view {shlex.quote(str(leftover))} --recover" in message
+        assert f"./vap view {shlex.quote(str(leftover))} --recover" in message
     done = vap("view", leftover, "--recover")
     path = leftover.with_name("two.rrd")
     assert (done.returncode, done.stdout) == (0, f"wrote {path}\n"), done.stderr
@@ -136,7 +136,7 @@ def test_sixty_steps_of_three_cameras_stay_small_and_quick(tmp_path: Path) -> No
         return time.process_time() - began
 
     ratios = [cpu_s(records, n) / cpu_s(encodes, n) for n in range(3)]
-    assert (tmp_path / "0.rrd").stat().st_size < 4e6
+    assert (tmp_path / "0.rrd").stat().st_size < 4.2e6
     assert np.median(ratios) < 10, ratios
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import rerun as rr
@@ -89,7 +88,7 @@ class Streamed:
         self._rec.send_recording_name(name)
         log_row(self._rec, "/", rr.AnnotationContext(CLASSES))
 
-    def __enter__(self) -> Self:
+    def __enter__[R: Streamed](self: R) -> R:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

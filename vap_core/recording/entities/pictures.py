@@ -342,8 +342,6 @@ def send_outlines(
             colors=[OUTLINES[classes.get(name, OTHER_CLASS)] for name in names],
         )
         rec.send_columns(f"{entity}/labels", index, points.partition(lengths))
-        static = rr.Points2D.from_fields(radii=0, show_labels=True)
-        log_row(rec, f"{entity}/labels", static)
 
 
 def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], jpeg_quality: int) -> None:

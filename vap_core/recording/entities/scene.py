@@ -159,7 +159,7 @@ def send_truth(
 
 
 def log_cameras(rec: rr.RecordingStream, frame: Frame) -> None:
-    """Intrinsics, once; `send_camera_poses` sends the rest."""
+    """Intrinsics and the style of names, once; `send_camera_poses` sends the rest."""
     for i, camera in enumerate(frame.cameras):
         pinhole = rr.Pinhole(
             image_from_camera=camera.k,
@@ -169,6 +169,8 @@ def log_cameras(rec: rr.RecordingStream, frame: Frame) -> None:
             color=camera_colour(i),
         )
         log_row(rec, image_root(camera.name), pinhole)
+        names = rr.Points2D.from_fields(radii=0, show_labels=True)
+        log_row(rec, f"{image_root(camera.name)}/identity/labels", names)
 
 
 def send_camera_poses(
