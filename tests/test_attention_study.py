@@ -283,9 +283,9 @@ def test_a_figure_has_the_suites_in_the_order_of_the_benchmarks() -> None:
         for name in ("lift", "lift_lookalikes"):
             line |= {name: 1.0, f"{name}_low": 0.5, f"{name}_high": 2.0}
         lines.append(line)
-    (axes,) = figures.where_figure(pd.DataFrame(lines)).axes
-    headings = [text.get_text() for text in axes.texts if text.get_fontweight() == "bold"]
-    assert headings == [*suites.BENCHMARKS, figures.ALL_SUITES]
+    panels = figures.where_figure(pd.DataFrame(lines)).axes
+    titles = [axes.get_title().removesuffix(", n 3") for axes in panels]
+    assert titles == [*suites.BENCHMARKS, figures.ALL_SUITES]
 
 
 def test_the_figure_over_time_says_how_many_episodes_touch_something_beside_its_curves() -> None:

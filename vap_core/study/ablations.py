@@ -241,7 +241,7 @@ def effects_figure(arms: "pd.DataFrame", title: str = "", columns: int = 1) -> "
         .map(done * columns // (len(lines) + len(order)))
         .map(lambda part: " " * (int(part) + 1))
     )
-    label = f"points of success against the first arm [95 %]; filled: exact p < {LEVEL:g}, Holm"
+    label = f"points of success [95 %]; filled: exact p < {LEVEL:g}, Holm"
     series = "series" if lines["series"].nunique() > 1 else ""
     return charts.dots(
         lines,

@@ -382,8 +382,8 @@ def causal_table(causal: "pd.DataFrame") -> "pd.DataFrame":
     return in_order(rounded.reset_index())
 
 
-def where_figure(table: "pd.DataFrame") -> "Figure":
-    """Density of attention on the target and on its look-alikes, by suite, method and query.
+def where_figure(table: "pd.DataFrame", title: str = "") -> "Figure":
+    """Density of attention on the target and on its look-alikes, a panel per suite.
 
     `table` is `where_queries_look`'s; 1 is what an even attention would have, intervals are over
     layouts.
@@ -392,7 +392,8 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
 
     lines = in_order(table)
     lines = lines.assign(
-        line=lines["method"] + " · " + lines["query"] + ", n " + lines["n"].map(str)
+        line=lines["method"] + " · " + lines["query"],
+        suite=lines["suite"].astype(str) + ", n " + lines["n"].map(str),
     )
     marks = []
     for name, region in (("lift", "target"), ("lift_lookalikes", "look-alikes")):
@@ -402,7 +403,14 @@ def where_figure(table: "pd.DataFrame") -> "Figure":
     label = "attention per area before the first touch, whole view = 1 [95 %]"
     most = 1.05 * float(shown["high"].max())
     return charts.dots(
-        shown, "line", group="suite", series="region", label=label, scale=1.0, limits=(0.0, most)
+        shown,
+        "line",
+        panel="suite",
+        series="region",
+        label=label,
+        title=title,
+        scale=1.0,
+        limits=(0.0, most),
     )
 
 
