@@ -41,7 +41,12 @@ END_TO_END = {
     "test_sim", "test_soft_prompt", "test_survey_tables", "test_tokens",
 }  # fmt: skip
 """Modules that run whole episodes, trainings or commands: slow, so `make check` leaves them out."""
-LONG = {"test_contracts", "test_kills", "test_objects", "test_outgoing", "test_own_policy", "test_pair_training", "test_same_inputs"}  # fmt: skip
+LONG = {
+    "test_attention_recording", "test_contracts", "test_kills", "test_menagerie", "test_objects", "test_obedience",
+    "test_outgoing", "test_own_object", "test_own_policy", "test_own_suite", "test_pair_training", "test_policy_ahead",
+    "test_real_clients", "test_runtime", "test_same_inputs", "test_served", "test_shared", "test_split",
+    "test_training_folder", "test_training_language", "test_wheel", "test_wires",
+}  # fmt: skip
 """Others that take long."""
 
 

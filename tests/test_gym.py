@@ -27,7 +27,7 @@ def test_every_suite_passes_gymnasiums_checker(suite, task):
 
 def test_an_episode_with_sub_goals_is_refused():
     """Its reward was that of the first sub-goal."""
-    with pytest.raises(BadSuite, match="shared-sequence have sub-goals.*vap_core eval"):
+    with pytest.raises(BadSuite, match="shared-sequence have sub-goals.*vap eval"):
         VapEnv("shared-sequence", suites.suite("shared-sequence").tasks[0].name)
 
 
