@@ -155,7 +155,7 @@ def test_whatever_is_shown_is_put_into_known_words(
 
 def test_every_pixel_has_a_name_and_grey_needs_no_colour() -> None:
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    found = [COLOURS[i] for i in colour_indices(ramp, np.ones((1, 256), bool))[0]]
+    found = [COLOURS[i] for i in colour_indices(ramp, np.ones((1, 256), bool))[0][0]]
     assert (found[0], found[255]) == ("black", "white")
     assert [name for i, name in enumerate(found) if i == 0 or name != found[i - 1]] == [
         "black",

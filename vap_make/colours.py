@@ -8,7 +8,6 @@ It is no test of a tint, which goes by HSV (`prompt.has_colour`).
 from collections.abc import Iterable, Sequence
 from functools import cache
 
-import cv2
 import numpy as np
 
 from vap_core.base.types import Mask, Rgb
@@ -53,11 +52,8 @@ def shares(rgb: Rgb, mask: Mask) -> dict[str, float]:
     rows, columns = mask.any(axis=1), mask.any(axis=0)
     box = np.ix_(rows, columns)
     rgb, mask = rgb[box], mask[box]
-    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[mask]
-    index = colour_indices(rgb, mask)[mask]
-    angle = np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) % 360.0
+    index, angle, chroma = (part[mask] for part in colour_indices(rgb, mask))
     hue = len(NEUTRALS) + np.digitize(angle, list(HUES_DEG.values())) % len(HUES_DEG)
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
     earthy = np.isin(index, [COLOURS.index("brown"), COLOURS.index("beige")])
     earthy &= (chroma < RED_CHROMA) | ((angle > RED_DEG) & (angle < HUES_DEG["yellow"]))
     vivid = (chroma >= CHROMA) & ~earthy

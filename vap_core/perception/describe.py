@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from vap_core.base.errors import BadEndpoint
 from vap_core.base.types import Boxes, Description, Mask, PersonalObject, Rgb, value
@@ -34,8 +34,10 @@ VIVID_CHROMA = 38.0
 """Chroma from which warm colours are neither brown nor beige."""
 
 
-def colour_indices(rgb: Rgb, mask: Mask) -> Int64[np.ndarray, "h w"]:
-    """Of every pixel, the index of its colour in `COLOURS`.
+def colour_indices(
+    rgb: Rgb, mask: Mask
+) -> tuple[Int64[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Of every pixel, the index of its colour in `COLOURS`, its hue in degrees and its chroma.
 
     What counts as white depends on the brightest grey pixels in `mask`, so that a white object is
     white in its shaded parts too.
@@ -60,7 +62,7 @@ def colour_indices(rgb: Rgb, mask: Mask) -> Int64[np.ndarray, "h w"]:
     faint |= (light > 80) & (chroma < 1.7 * GREY_CHROMA)
     white_from = _white_lightness(light[faint & mask])
     neutral = np.where(light < 26, BLACK, np.where(light < white_from, GREY, WHITE))
-    return np.where(faint, neutral, colour).astype(np.int64)
+    return np.where(faint, neutral, colour).astype(np.int64), angle, chroma
 
 
 def add_shade(name: str, lightness: float) -> str:
@@ -119,7 +121,7 @@ def measure_crop(rgb: Rgb, segmenter: Segmenter) -> CropAttributes:
     gain = float(np.clip(BRIGHT_LEVEL / max(brightest, 1.0), 1.0, 1.4))
     lit = np.clip(small * gain, 0, 255).astype(np.uint8)
     lightness = cv2.cvtColor(lit.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[..., 0]
-    indices = colour_indices(lit, mask)
+    indices, _, _ = colour_indices(lit, mask)
     parts = {name: (indices == index) & mask for index, name in enumerate(COLOURS)}
     height, width = _extent(mask)
     ratio = height / width

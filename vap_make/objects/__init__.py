@@ -122,6 +122,7 @@ FIXED: dict[str, ObjectModel] = {name: _drawn(model) for name, model in OBJECTS.
 """Personal instances, look-alikes and props: their parameters are the catalogue's rows."""
 
 
+@lru_cache(maxsize=DYES)
 def draw_dye(number: int) -> Dye:
     """Any hue, more or less vivid; now and then only half an object is dyed."""
     rng = np.random.default_rng([22, number])
