@@ -37,10 +37,12 @@ from vap_core.study.results import (
     load_runs,
     outcomes,
     provenance,
+    reads_simulator,
     results,
     track_title,
 )
 from vap_core.study.stats import (
+    ALL_TASKS,
     RATES,
     RESAMPLES,
     TRACK,
@@ -266,19 +268,24 @@ MOST_FINDINGS, MOST_LINES = 5, 16
 
 
 def findings(lines: "pd.DataFrame", compared: "pd.DataFrame") -> list[str]:
-    """For every track and policy how often each method succeeds, best first, and by how much the
-    best is above the first method on the same episodes.
+    """For every track and policy how often the two best methods and the first one succeed, and by
+    how much the best is above the first on the same episodes.
     """
     found = []
     by = [*TRACK, "policy"]
     for (suite, split, policy), part in lines.groupby(by, sort=False):
-        whole = part[part["task"].eq(part["task"].iloc[-1])]  # all tasks, where there are several
+        # All tasks, where there are several; bounds are no results, unless nothing else ran.
+        whole = part[
+            part["task"].eq(part["task"].iloc[-1]) & (part["bound"] <= part["bound"].min())
+        ]
         ranked = whole.sort_values("sr", ascending=False, kind="stable").to_dict("records")
-        rates = [f"{line['method']} in {percent(line['sr'])} % of {line['n']}" for line in ranked]
+        first = whole["method"].iloc[0]
+        shown = [line for i, line in enumerate(ranked) if i < 2 or line["method"] == first]
+        rates = [f"{line['method']} in {percent(line['sr'])} % of {line['n']}" for line in shown]
         rates[0] = rates[0].replace(" in ", " succeeds in ")
         text = f"{track_title(str(suite), str(split))}: {', '.join(rates)}"
         same = whole[[*by, "task", "method"]].rename(columns={"method": "one"}).head(1)
-        pairs = compared.merge(same).sort_values("difference", ascending=False).head(1)
+        pairs = compared.merge(same.assign(other=ranked[0]["method"]))
         for pair in pairs.itertuples():
             points = points_text(pair, digits=1)
             text += f"; {pair.other} - {pair.one}: {points} points, p {p_text(pair.p)}"
@@ -287,7 +294,9 @@ def findings(lines: "pd.DataFrame", compared: "pd.DataFrame") -> list[str]:
 
 
 def summary(runs: Runs, lines: "pd.DataFrame", compared: "pd.DataFrame") -> str:
-    """At most MOST_LINES lines for a terminal: the findings, what is missing, and why it failed."""
+    """At most MOST_LINES lines for a terminal: the findings, what is missing, why the best method
+    of every suite failed, and the rates where there is room.
+    """
     found = findings(lines, compared)
     parts = found[:MOST_FINDINGS]
     if len(found) > MOST_FINDINGS:
@@ -295,12 +304,16 @@ def summary(runs: Runs, lines: "pd.DataFrame", compared: "pd.DataFrame") -> str:
     parts += [f"unfinished: {line}" for line in runs.unfinished[:2]]
     parts += [f"errors: {line}" for line in errors(runs)[:2]]
     if "case" in runs.table and runs.table["outcome"].eq("failure").any():
-        why = sub_cases_text(breakdown(runs.table)).splitlines()
-        parts += [f"failures of {line}"[:160] for line in why[:4]]
-    table = printed(result_table(lines)[["task", "method", "n", "SR % [95 %]", "CMR % [95 %]"]])
-    room = MOST_LINES - 1 - len(parts)
-    rows = table.splitlines()
-    return "\n".join([*parts, "", *(rows if len(rows) <= room else rows[:0])]).rstrip()
+        counts = breakdown(runs.table.drop(reads_simulator(runs.table).index))
+        best = counts.sort_values("failed", kind="stable").drop_duplicates("suite")
+        parts += [f"failures of {line}"[:160] for line in sub_cases_text(best).splitlines()[:4]]
+    table = result_table(lines)[["task", "method", "n", "SR % [95 %]", "CMR % [95 %]"]]
+    if lines["suite"].nunique() > 1:
+        table["task"] = lines["suite"] + " " + table["task"]
+    room = MOST_LINES - 3 - len(parts)
+    if len(table) > room:
+        table = table[lines["task"].eq(ALL_TASKS)]
+    return "\n".join([*parts, *(["", printed(table)] if 0 < len(table) <= room else [])])
 
 
 def _sections(
