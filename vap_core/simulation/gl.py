@@ -111,14 +111,16 @@ def keep_contexts() -> None:
 
     class Kept(gl_context.GLContext):
         def free(self) -> None:
-            spare.__dict__.setdefault("contexts", []).append(self)
+            self.left.append(self)
 
         def __del__(self) -> None:
-            """It may be freed after its renderer alone."""
+            """Its renderer, which may go first or last, frees it."""
 
     def take(width: int, height: int) -> Kept:
-        left = spare.__dict__.get("contexts")
-        return left.pop() if left else Kept(width, height)
+        left = spare.__dict__.setdefault("contexts", [])
+        context = left.pop() if left else Kept(width, height)
+        context.left = left
+        return context
 
     gl_context.GLContext = take
 
