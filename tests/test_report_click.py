@@ -38,7 +38,9 @@ def test_the_page_is_whole_and_a_click_gives_the_recording_of_a_failure(tmp_path
             assert title in text
         (tmp_path / "page.png").write_bytes(page.screenshot())
         link = page.find(".failures article a")[0]
-        words = page.script("return arguments[0].parentElement.innerText", {browser.ELEMENT: link})
+        words = page.script(
+            'return arguments[0].closest("article").innerText', {browser.ELEMENT: link}
+        )
         page.click(link)
         (got,) = page.wait(
             lambda: list((tmp_path / browser.DOWNLOADS).glob("*.rrd")), "the recording"
