@@ -424,7 +424,7 @@ def attention_screenshot(rrd: Path, png: Path, *, frame_index: int | None = None
     if not queries:
         raise BadRecording(
             f"view: {rrd.name} holds no attention; record it with --attention all, or by "
-            "python -m vap_core measure attention RUN --record SUITE/TASK/METHOD/EPISODE."
+            "./vap measure attention RUN --record SUITE/TASK/METHOD/EPISODE."
         )
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(scratch) / rrd.name
