@@ -14,7 +14,7 @@ PYTEST := $(RUN) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 help:
 	@echo "make demo      set up what is missing, then the main job: VAP against generic on two robots, with recordings"
 	@echo "make check     for every day: lint, types and unit tests; two and a half minutes"
-	@echo "make test      lint, types, all tests but the sweeps, and notebooks; eleven to 12 minutes on two cores"
+	@echo "make test      lint, types, all tests but the sweeps, and notebooks; nine to ten minutes on two cores"
 	@echo "make test-all  make test, and the long sweeps"
 	@echo "make audit     known vulnerabilities of the pinned packages; needs the internet"
 	@echo "make lab       open the notebooks in JupyterLab"
