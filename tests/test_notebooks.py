@@ -155,7 +155,7 @@ def test_the_first_cell_answers_its_question(path: Path) -> None:
     first = "".join(READ[path]["cells"][0]["source"])
     assert "below the next cell" not in first
     answer = first.split("**Answer.**")[1].split("\n\n")[0]
-    assert len(answer.split()) <= 65
+    assert len(answer.split()) <= 60
     words = sum(len(text.split()) for text in markdown(path).values())
     assert words <= (1200 if path.name.startswith("07") else 900)
 

@@ -103,11 +103,11 @@ def tell(thread: int) -> None:
     """Keep the clocks of bars moving; without one say in longer and longer intervals which
     functions run, and how long.
     """
-    from tqdm import tqdm
-
     start, wait_s = time.monotonic(), PATIENCE_S
     while True:
         time.sleep(1.0)
+        from tqdm import tqdm  # a command of less than a second needs none
+
         bars = list(tqdm._instances)
         for bar in bars:
             bar.refresh()

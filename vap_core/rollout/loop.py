@@ -146,20 +146,27 @@ def rollout(
     keeps_images = sink is not None or keep_images
     for first in range(0, len(rows), batch):
         running = [_begin(trial, row, keeps_images) for row in rows[first : first + batch]]
+        _run(trial, running, sink, keep_images)
+        while running:  # an episode that has ended keeps no environment
+            yield _end(trial, running.pop(0))
+
+
+def _run(
+    trial: Trial, running: Sequence[RunningEpisode], sink: OpenSink | None, keep_images: bool
+) -> None:
+    """Step the episodes together until all have ended."""
+    live = _live(running)
+    while live:
+        for episode in live:
+            _guard(episode, next_subgoal, episode, trial.policy)
+        live = _live(live)
+        steps = _observe_and_prompt(trial, live, sink)
+        live = _live(live)
+        _plan(trial, live, steps)
+        for episode in _live(live):
+            observation, attended = steps[id(episode)]
+            _guard(episode, _act, trial, episode, observation, attended, keep_images)
         live = _live(running)
-        while live:
-            for episode in live:
-                _guard(episode, next_subgoal, episode, trial.policy)
-            live = _live(live)
-            steps = _observe_and_prompt(trial, live, sink)
-            live = _live(live)
-            _plan(trial, live, steps)
-            for episode in _live(live):
-                observation, attended = steps[id(episode)]
-                _guard(episode, _act, trial, episode, observation, attended, keep_images)
-            live = _live(running)
-        for episode in running:
-            yield _end(trial, episode)
 
 
 def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:

@@ -218,8 +218,8 @@ def run_job(job: Job) -> Rows:
     )
     with unchanged_weights(trial.policy) as checksum:
         # Other libraries' environments take memory: one at a time.
-        groups = [job.rows] if isinstance(trial.scene, Scene) else [[row] for row in job.rows]
-        episodes = [each for rows in groups for each in rollout(trial, rows, begin, batch=BATCH)]
+        batch = BATCH if isinstance(trial.scene, Scene) else 1
+        episodes = list(rollout(trial, job.rows, begin, batch=batch))
     steps.write(job.folder, episodes)
     logs.write_states(job.folder, episodes)
     logs.write_audit(job.folder, episodes)

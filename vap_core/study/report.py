@@ -231,8 +231,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
     ends = outcomes(runs)
     origins = provenance(runs)
     compared = compare(runs.table, runs.methods)
-    shown = summary(runs, lines, compared)
-    text = "\n\n".join(["# Report", *_sections(runs, lines, ends, compared, origins)])
+    found = findings(lines, compared)
     rates = [f"{name}{part}" for name in RATES for part in ("", "_low", "_high")]
     rates += ["sr_layout_low", "sr_layout_high", "paper_sr", "paper_cmr"]
     figures = {"forest.png": forest(lines)}
@@ -241,7 +240,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
         for (suite, split), part in lines.groupby(TRACK, sort=False)
     }
     tables = {"Results": by_track, "Outcomes": {"": outcome_table(ends)}}
-    found = findings(lines, compared)
+    text = "\n\n".join(["# Report", *_sections(runs, found, tables, compared, origins)])
     files = {
         "report.md": f"{text}\n",
         "results.csv": _csv(lines, rates),
@@ -260,7 +259,7 @@ def report(sources: Sequence[Path], out: Path) -> str:
             write_png(figure, out / name)
         for name in {"paired.png", "comparisons.csv"} - {*files, *figures}:  # of an earlier report
             (out / name).unlink(missing_ok=True)
-    return shown
+    return summary(runs, found, lines)
 
 
 MOST_FINDINGS, MOST_LINES = 5, 16
@@ -293,12 +292,11 @@ def findings(lines: "pd.DataFrame", compared: "pd.DataFrame") -> list[str]:
     return found
 
 
-def summary(runs: Runs, lines: "pd.DataFrame", compared: "pd.DataFrame") -> str:
+def summary(runs: Runs, found: Sequence[str], lines: "pd.DataFrame") -> str:
     """At most MOST_LINES lines for a terminal: the findings, what is missing, why the best method
     of every suite failed, and the rates where there is room.
     """
-    found = findings(lines, compared)
-    parts = found[:MOST_FINDINGS]
+    parts = list(found[:MOST_FINDINGS])
     if len(found) > MOST_FINDINGS:
         parts.append(f"and {len(found) - MOST_FINDINGS} more tracks: in the report")
     parts += [f"unfinished: {line}" for line in runs.unfinished[:2]]
@@ -318,15 +316,15 @@ def summary(runs: Runs, lines: "pd.DataFrame", compared: "pd.DataFrame") -> str:
 
 def _sections(
     runs: Runs,
-    lines: "pd.DataFrame",
-    ends: "pd.DataFrame",
+    found: Sequence[str],
+    tables: "Mapping[str, Mapping[str, pd.DataFrame]]",
     compared: "pd.DataFrame",
     origins: "pd.DataFrame",
 ) -> Iterator[str]:
-    """The paragraphs of report.md behind its title."""
+    """The paragraphs of report.md behind its title, as `report_page` shows `found` and `tables`."""
     several = "s" if len(runs.manifests) > 1 else ""
     asked = f"{runs.wanted['asked'].sum()} episodes that {len(runs.manifests)} run{several}"
-    yield "\n".join(f"- {line}" for line in findings(lines, compared))
+    yield "\n".join(f"- {line}" for line in found)
     yield "\n".join(
         [
             f"{len(runs.table)} of the {asked} asked for.",
@@ -335,12 +333,11 @@ def _sections(
         ]
     )
     yield from ("## Results", RESULTS_NOTE)
-    for (suite, split), part in lines.groupby(TRACK, sort=False):
-        yield f"### {track_title(str(suite), str(split))}"
-        yield printed(result_table(part), "markdown")
-        if suite == "tabletop":
+    for title, shown in tables["Results"].items():
+        yield from (f"### {title}", printed(shown, "markdown"))
+        if title == "tabletop":
             yield paper.real_arm()
-    yield from ("## Outcomes", printed(outcome_table(ends), "markdown"))
+    yield from ("## Outcomes", printed(tables["Outcomes"][""], "markdown"))
     tracebacks = [f"- {line}" for line in errors(runs)]
     if tracebacks:
         yield "\n".join(["Errors, by the last line of their tracebacks:", *tracebacks])
@@ -354,9 +351,9 @@ def _sections(
         yield from (COMPARISONS_NOTE, printed(comparison_table(compared), "markdown"))
     else:
         yield "No two methods ran the same episodes under one policy."
-    found = abstentions(runs.table)
-    if len(found):  # a suite was run with and without its targets
-        yield from ("## Abstention", ABSTENTION_NOTE, printed(found, "markdown"))
+    abstained = abstentions(runs.table)
+    if len(abstained):  # a suite was run with and without its targets
+        yield from ("## Abstention", ABSTENTION_NOTE, printed(abstained, "markdown"))
     yield from ("## Pictures", "![Success rates with 95 % intervals](forest.png)")
     if len(compared):
         yield "![Differences from the first method on the same episodes](paired.png)"
@@ -609,7 +606,8 @@ def conclude(study: "Study", table: "pd.DataFrame", folder: Path) -> str:
         for method, part in table.groupby("method", sort=False)
     }
     times = ", ".join(f"{method} {ms:.0f} ms" for method, ms in parts.items())
-    text = [summary(runs, results(runs), compare(runs.table, runs.methods))]
+    rates = results(runs)
+    text = [summary(runs, findings(rates, compare(runs.table, runs.methods)), rates)]
     text += ["", f"a control step takes: {times}", f"wrote {summary_path}, {figure}"]
     recordings = sorted((folder / "recordings").glob("*.rrd"))
     if recordings:

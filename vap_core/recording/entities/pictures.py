@@ -311,10 +311,7 @@ def send_outlines(
         spots: list[tuple[float, float]] = []
         names: list[str] = []
         zoom = min(len(frames[0].cameras), 2) / 2
-        room_x, room_y = (
-            zoom * LABEL_SHARES[0] * camera.width,
-            zoom * LABEL_SHARES[1] * camera.height,
-        )
+        room = zoom * LABEL_SHARES[0] * camera.width, zoom * LABEL_SHARES[1] * camera.height
         for frame in frames:
             owner, before = _empty_image(camera), len(names)
             for name, mask in frame.truth.masks.get(camera.name, {}).items():
@@ -322,16 +319,7 @@ def send_outlines(
                 if box is not None and name in labels:
                     owner |= mask.view(np.uint8) * np.uint8(classes.get(name, OTHER_CLASS))
                     names.append(name)
-                    x0, y0, x1, y1 = box.tolist()
-                    x, taken = (x0 + x1) / 2, spots[before:]
-                    places = (y1 + 2, y0 - room_y, y1 + 2 + room_y)
-                    free = [
-                        y
-                        for y in places
-                        if y + room_y < camera.height
-                        and all(abs(x - a) > room_x or abs(y - b) > room_y for a, b in taken)
-                    ]
-                    spots.append((x, [*free, places[0]][0]))
+                    spots.append(_label_spot(box, room, spots[before:], camera.height))
             images.append(np.where(owner == 0, cv2.dilate(owner, CROSS), 0).astype(np.uint8))
             lengths.append(len(names) - before)
         entity = f"{image_root(camera.name)}/identity"
@@ -342,6 +330,24 @@ def send_outlines(
             colors=[OUTLINES[classes.get(name, OTHER_CLASS)] for name in names],
         )
         rec.send_columns(f"{entity}/labels", index, points.partition(lengths))
+
+
+def _label_spot(
+    box: np.ndarray, room: tuple[float, float], taken: Sequence[tuple[float, float]], height: int
+) -> tuple[float, float]:
+    """Where the name of an object has room among those that stand: below its box, above it, or a
+    line further down; below it, too, where none is free.
+    """
+    x0, y0, x1, y1 = box.tolist()
+    x = (x0 + x1) / 2
+    places = (y1 + 2, y0 - room[1], y1 + 2 + room[1])
+    free = [
+        y
+        for y in places
+        if y + room[1] < height
+        and all(abs(x - a) > room[0] or abs(y - b) > room[1] for a, b in taken)
+    ]
+    return x, [*free, places[0]][0]
 
 
 def send_attention(rec: rr.RecordingStream, frames: Sequence[Frame], jpeg_quality: int) -> None:
