@@ -110,6 +110,19 @@ def test_neither_batch_nor_order_nor_global_seeds_change_an_episode(bank: Path) 
         same(one, third)
 
 
+def test_the_rows_of_its_job_do_not_change_an_episode(tmp_path: Path) -> None:
+    study = Study((("simpler-bridge", "put-straw-cup"),), ("generic",), policy="random")
+    rows = study.rows(*study.tasks[0])
+    row = replace(rows[14], max_steps=3)
+    trials = [make_trial(study, [row, *beside], "generic", tmp_path) for beside in ([], [rows[2]])]
+    alone, together = (next(iter(rollout(trial, [row]))) for trial in trials)
+    same(alone, together)
+    for one, other in zip(alone.frames, together.frames, strict=True):
+        assert one.truth.objects_world.keys() == {place.model for place in row.placements}
+        for name, pose in one.truth.objects_world.items():
+            assert np.array_equal(pose, other.truth.objects_world[name])
+
+
 def test_the_prompt_reaches_the_policy_and_only_the_prompt(bank: Path) -> None:
     seen: list[PolicyInput] = []
     trial = make_trial(STUDY, STUDY.rows(SUITE, TASK), "vap", bank)

@@ -68,6 +68,7 @@ from vap_core.simulation.control import BEYOND
 from vap_core.simulation.env import Control, Env
 from vap_core.simulation.looks import PERFECT, Sensor
 from vap_core.simulation.occluder import Occlusion
+from vap_core.simulation.scenes import Scene
 from vap_core.simulation.suites.open_row import cameras_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Observation
@@ -175,9 +176,16 @@ def _live(episodes: Sequence[RunningEpisode]) -> list[RunningEpisode]:
 
 
 def _env(trial: Trial, row: EpisodeRow) -> Environment:
-    """An environment for the row's episode, in which it has not begun."""
+    """An environment for the row's episode, in which it has not begun.
+
+    Its scene holds what the row places and no more: the last bits of the physics depend on every
+    object in a scene, and an episode must not depend on the rows beside it.
+    """
+    scene = trial.scene
+    if isinstance(scene, Scene):
+        scene = scene.only([place.model for place in row.placements])
     return open_env(
-        trial.scene,
+        scene,
         cameras_of(row),
         image_size=trial.image_size,
         control=trial.control,
@@ -524,6 +532,8 @@ def _end(trial: Trial, episode: RunningEpisode) -> Episode:
     with _timed(episode.seconds, "record"):
         if episode.sink is not None:
             _guard(episode, episode.sink.close, episode.outcome)
+    if isinstance(episode.env, Env):
+        episode.env.scene.close()
     header = episode.header
     if header is None:
         header = _header(trial, episode, unchanged({}, episode.row.instruction))

@@ -183,6 +183,8 @@ class Renderer:
         self.model = model
         self.objects = tuple(objects)
         self.shadows = shadows
+        if not shadows:
+            model.vis.quality.shadowsize = 0  # a map that nothing is drawn from takes 64 MB
         self._renderers: dict[tuple[int, int, int], mujoco.Renderer] = {}
         self._groups = model.geom_group.copy()
         self._owner = np.where(hand_geoms(model), HAND, object_of_geoms(model, self.objects))

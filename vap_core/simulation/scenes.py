@@ -1,6 +1,6 @@
 """A scene: a room, a table, one robot, the objects and the cameras.
 
-Compiled once, and shared by every episode that uses it. The world frame stands on the table top
+The world frame stands on the table top
 (z = 0) at the robot's base: x away from the robot, y to its left, z up; metres.
 """
 
@@ -32,10 +32,13 @@ class Scene:
     """A compiled scene.
 
     `objects` are body names, each free to move by its joint `<name>/free`; `sizes_m` are their full
-    extents.
+    extents. `models`, `style` and `meshes` are what it was built of.
     """
 
     robot: Robot
+    models: "tuple[objects.ObjectModel, ...]"
+    style: SceneStyle
+    meshes: Meshes
     model: mujoco.MjModel
     sizes_m: Mapping[str, tuple[float, float, float]]
     cameras: tuple[str, ...]
@@ -50,6 +53,18 @@ class Scene:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def only(self, names: Sequence[str]) -> "Scene":
+        """A scene like this one with only the objects of these names, in their order.
+
+        Raises: UnknownName for an object that this scene lacks.
+        """
+        held = {model.name: model for model in self.models}
+        for name in names:
+            if name not in held:
+                raise one_of("Scene.only: object", name, held)
+        models = [held[name] for name in dict.fromkeys(names)]
+        return build(self.robot.name, models, style=self.style, meshes=self.meshes)
 
     def close(self) -> None:
         """Release the GL contexts; the scene may be used again and makes new ones."""
@@ -83,16 +98,23 @@ def build(
     base.pos = arm.base_world[:3]
     base.quat = arm.base_world[3:]
     _add_room(spec, arm, style)
-    sizes_m = {}
-    for i, model in enumerate(models):
-        if isinstance(model, str):
-            model = objects.get_object(model)
+    held = tuple(objects.get_object(model) if isinstance(model, str) else model for model in models)
+    for i, model in enumerate(held):
         add_object(spec, model, parked(arm, i))
-        sizes_m[model.name] = objects.extent_m(model)
+    sizes_m = {model.name: objects.extent_m(model) for model in held}
     cameras = add_rigs(spec, robot, style.camera_shift_m)
     compiled = spec.compile()
     renderer = Renderer(compiled, tuple(sizes_m), style.shadows)
-    return Scene(robot=arm, model=compiled, sizes_m=sizes_m, cameras=cameras, renderer=renderer)
+    return Scene(
+        robot=arm,
+        models=held,
+        style=style,
+        meshes=meshes,
+        model=compiled,
+        sizes_m=sizes_m,
+        cameras=cameras,
+        renderer=renderer,
+    )
 
 
 def meshes_called(name: str) -> Meshes:
