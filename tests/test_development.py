@@ -14,7 +14,7 @@ from vap_core.rollout.loop import Trial, rollout
 from vap_core.rollout.prompters import generic
 from vap_core.simulation import suites
 from vap_core.simulation.assets import objects
-from vap_core.simulation.suites import BENCHMARKS, lists
+from vap_core.simulation.suites import BENCHMARKS, lists, shared
 from vap_core.simulation.suites.open_row import build_scene, make_env
 from vap_core.simulation.types import EpisodeRow
 from vap_core.study import stats
@@ -95,9 +95,33 @@ def test_a_development_list_has_the_policy_of_its_benchmark() -> None:
     assert set(weights_by_suite(pair).values()) == {"a" * 12}
 
 
+def test_twins_stand_where_the_lookalikes_of_the_list_do(name: str) -> None:
+    rows = suites.benchmark(f"{name}-twins")
+    shown = Counter(place.model for row in rows for place in row.placements)
+    for row, listed in zip(rows, suites.benchmark(name), strict=True):
+        hardest = set(shared.hardest(row.target.removesuffix("-personal")))
+        pairs = list(zip(row.placements, listed.placements, strict=True))
+        assert hardest == {one.model for one, other in pairs if "-lookalike-" in other.model}
+        same = replace(listed, suite=f"{name}-twins", placements=row.placements)
+        assert asdict(row) == asdict(same)
+        for one, other in pairs:
+            assert asdict(replace(one, model=other.model)) == asdict(other)
+            assert one.model in hardest or one.model == other.model
+        assert all(gap_m(one, other) > 0.015 for one, other in combinations(row.placements, 2))
+        assert len({shown[twin] for twin in hardest}) == 1
+
+
 def test_names_of_suites() -> None:
     assert suites.suite("tabletop-dev-absent").robot == "so101"
-    for wrong in ("tabletop-absent-dev", "widowx-pick-dev", "tabletop-", "-dev", "absent"):
+    for wrong in (
+        "tabletop-dev-twins",
+        "shared-pair-twins",
+        "tabletop-absent-dev",
+        "widowx-pick-dev",
+        "tabletop-",
+        "-dev",
+        "absent",
+    ):
         with pytest.raises(UnknownName, match="a benchmark also with -dev") as refused:
             suites.suite(wrong)
         assert len(str(refused.value)) <= 330

@@ -81,7 +81,7 @@ def _models(scene: shared.Shared, rng: np.random.Generator) -> list[str]:
     beside = []
     for stem, target in zip(stems, targets, strict=True):
         personal = f"{stem}-personal"
-        beside.append(shared.HARDEST[stem] if target == personal else personal)
+        beside.append(shared.hardest(stem)[0] if target == personal else personal)
     return [*targets, *beside]
 
 
@@ -118,7 +118,7 @@ def _on_desk(scene: shared.Shared, rng: np.random.Generator) -> tuple[Placement,
     pair = None
     if scene.owner_of_goal:
         step = scene.steps[0]
-        pair = (step.model, step.goal, shared.HARDEST[step.stem])
+        pair = (step.model, step.goal, shared.hardest(step.stem)[0])
     while True:
         spots = try_desk(models, within, fixed=fixed, gap_m=gap_m, pair=pair, rng=rng)
         if spots is not None:

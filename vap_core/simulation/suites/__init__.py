@@ -3,7 +3,8 @@
 The episode lists of benchmarks and shared scenes are hashed files; those of the warm-up suites are
 generated. Every benchmark has a development list, the suite NAME-dev. NAME-absent and
 NAME-dev-absent are the same lists with the target left out; NAME-red and NAME-dev-red have a
-look-alike that is red by nature. Where a suite's sensor has noise (tabletop), each of these draws
+look-alike that is red by nature. NAME-twins has the two hardest look-alikes in the places of those
+that NAME draws. Where a suite's sensor has noise (tabletop), each of these draws
 its own. A user's own suites come from files (own.py).
 """
 
@@ -43,7 +44,9 @@ ABSENT = "-absent"
 """Ends the name of a suite whose target is left out."""
 RED = objects.RED
 """Ends the name of a suite whose first look-alike is red by nature; -absent may follow it."""
-ENDINGS = (ABSENT, RED, DEVELOPMENT)
+TWINS = "-twins"
+"""Ends the name of a suite whose look-alikes are the two hardest."""
+ENDINGS = (ABSENT, RED, DEVELOPMENT, TWINS)
 """No suite of one's own ends so."""
 
 
@@ -57,8 +60,8 @@ def suite(name: str) -> Suite:
         return own_suite.suite
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -red, -absent, -dev-absent; your own "
-            f"by its file or {own.VARIABLE})",
+            "suites.suite: suite (a benchmark also with -dev, -red, -twins, -absent, -dev-absent; "
+            f"your own by its file or {own.VARIABLE})",
             name,
             [*SUITES, *ELSEWHERE],
         )
@@ -66,12 +69,12 @@ def suite(name: str) -> Suite:
 
 
 def list_name(name: str) -> str:
-    """The list that a suite reads, whatever is left out of it or painted red."""
-    return name.removesuffix(ABSENT).removesuffix(RED)
+    """The list that a suite reads, whatever is left out of it, painted red or replaced."""
+    return name.removesuffix(ABSENT).removesuffix(RED).removesuffix(TWINS)
 
 
 def benchmark_name(name: str) -> str:
-    """The benchmark of a suite: its own name, or that without -dev, -red and -absent.
+    """The benchmark of a suite: its own name, or that without -dev, -red, -twins and -absent.
 
     Of a shared scene, the benchmark whose robot and frozen policy it has.
     """
@@ -83,6 +86,8 @@ def is_listed(name: str) -> bool:
 
     A shared scene has one, too.
     """
+    if name.endswith(f"{DEVELOPMENT}{TWINS}"):  # a development list has its own look-alikes
+        return False
     return name in (*SHARED, *ELSEWHERE) or benchmark_name(name) in BENCHMARKS
 
 
@@ -133,7 +138,8 @@ def changed_lists(digests: Mapping[str, str]) -> list[str]:
 @cache
 def benchmark(name: str) -> tuple[EpisodeRow, ...]:
     """The whole list of a benchmark, or of its development list; for both without their targets, or
-    with a red look-alike. Of an own suite its whole list.
+    with a red look-alike; of a benchmark with its hardest look-alikes. Of an own suite its whole
+    list.
 
     Raises: BadSuite, naming row and field, also for a task, camera or object that does not exist.
     """
@@ -143,6 +149,8 @@ def benchmark(name: str) -> tuple[EpisodeRow, ...]:
         return tuple(replace(row, suite=name, start=left_out) for row in whole)
     if name.endswith(RED):
         return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
+    if name.endswith(TWINS):
+        return tuple(_with_twins(row, name) for row in benchmark(name.removesuffix(TWINS)))
     own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.rows
@@ -256,6 +264,16 @@ def _with_red_lookalike(row: EpisodeRow, name: str) -> EpisodeRow:
             placements[i] = replace(place, model=f"{place.model}{RED}")
             break
     return replace(row, suite=name, placements=tuple(placements))
+
+
+def _with_twins(row: EpisodeRow, name: str) -> EpisodeRow:
+    """The row with the two hardest look-alikes in the places of those that it draws."""
+    twins = iter(shared.hardest(row.target.removesuffix("-personal"))[:: (-1) ** row.episode])
+    placements = tuple(
+        replace(place, model=next(twins)) if "-lookalike-" in place.model else place
+        for place in row.placements
+    )
+    return replace(row, suite=name, placements=placements)
 
 
 def _check_names(names: set[str], known: set[str], where: str) -> None:

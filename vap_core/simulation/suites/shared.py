@@ -23,22 +23,36 @@ from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import Owned, SubGoal, SuccessRule
 
 SPEAKER = "anna"
-HARDEST = {
-    "camera": "camera-lookalike-5",
-    "owl-figurine": "owl-figurine-lookalike-2",
-    "straw-cup": "straw-cup-lookalike-2",
-    "vase": "vase-lookalike-5",
-    "plant": "plant-lookalike-3",
-    "cup": "cup-lookalike-2",
-    "scrubber": "scrubber-lookalike-1",
-    "stuffed-toy": "stuffed-toy-lookalike-1",
-    "pouch": "pouch-lookalike-1",
-    "slipper": "slipper-lookalike-1",
+HARDEST: dict[str, tuple[int, int]] = {
+    "bottle": (3, 4),
+    "camera": (5, 3),
+    "cat-figurine": (3, 1),
+    "cup": (2, 1),
+    "leather-bag": (1, 2),
+    "miniature-house": (1, 3),
+    "owl-figurine": (2, 4),
+    "paper-cup": (2, 1),
+    "pen-holder": (3, 4),
+    "plant": (3, 2),
+    "plushie": (1, 4),
+    "pouch": (1, 2),
+    "scrubber": (1, 2),
+    "shaver": (2, 5),
+    "shoe": (3, 1),
+    "slipper": (1, 2),
+    "straw-cup": (2, 4),
+    "stuffed-toy": (1, 2),
+    "vase": (5, 2),
 }
-"""The look-alike of greatest mean cosine with the personal instance's photos, by stem."""
+"""The two look-alikes of greatest mean cosine with the personal instance's photos, by stem."""
 BOWL = benchmarks.BOWL
 PLATE = "plate-prop"
 BASKET = "basket-prop"
+
+
+def hardest(stem: str) -> tuple[str, ...]:
+    """The two look-alikes that are hardest to tell from the personal instance, hardest first."""
+    return tuple(f"{stem}-lookalike-{number}" for number in HARDEST[stem])
 
 
 @value
@@ -53,7 +67,7 @@ class Step:
 
     @property
     def model(self) -> str:
-        return HARDEST[self.stem] if self.owner == "ben" else f"{self.stem}-personal"
+        return hardest(self.stem)[0] if self.owner == "ben" else f"{self.stem}-personal"
 
     @property
     def category(self) -> str:
