@@ -4,7 +4,6 @@
 absent, and so are calibrated cameras.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
@@ -16,6 +15,7 @@ from jaxtyping import Float32
 from vap_core.base.errors import BadAction, BadSuite
 from vap_core.base.types import Camera, Views, value
 from vap_core.simulation import robots
+from vap_core.simulation.env import timed
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import Action, EpisodeRow, Observation, Placement, Truth
 
@@ -116,19 +116,18 @@ class GymEnv:
         return Observation(self.look(self.image_size), self.state())
 
     def look(self, longer_px: int) -> Views:
-        start = time.perf_counter()
-        drawn = self._env.render()
         views = {}
-        for name in self.camera_names:
-            rgb = self.map.images[name](self._seen, drawn)
-            if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-                raise BadSuite(
-                    f"{self.map.name}: picture {name!r} is {rgb.dtype} {rgb.shape}; give uint8, "
-                    "height x width x 3."
-                )
-            scale = longer_px / max(rgb.shape[:2])
-            views[name] = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        self.seconds["render"] += time.perf_counter() - start
+        with timed(self.seconds, "render"):
+            drawn = self._env.render()
+            for name in self.camera_names:
+                rgb = self.map.images[name](self._seen, drawn)
+                if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+                    raise BadSuite(
+                        f"{self.map.name}: picture {name!r} is {rgb.dtype} {rgb.shape}; give "
+                        "uint8, height x width x 3."
+                    )
+                k = longer_px / max(rgb.shape[:2])
+                views[name] = cv2.resize(rgb, None, fx=k, fy=k, interpolation=cv2.INTER_AREA)
         return views
 
     def state(self) -> Float32[np.ndarray, " s"]:
@@ -138,12 +137,11 @@ class GymEnv:
         """Actions go as they are, cut to the space. Raises: BadAction."""
         if len(action) != len(self._low) or not np.isfinite(action).all():
             raise BadAction(f"{self.map.id}: {action.tolist()}; {len(self._low)} finite numbers.")
-        start = time.perf_counter()
-        cut = np.clip(action, self._low, self._high).astype(self._low.dtype)
-        self._seen, reward, ended, _, info = self._env.step(cut)
-        self._steps += 1
-        self._succeeded |= bool(self.map.success(float(reward), ended, info))
-        self.seconds["physics"] += time.perf_counter() - start
+        with timed(self.seconds, "physics"):
+            cut = np.clip(action, self._low, self._high).astype(self._low.dtype)
+            self._seen, reward, ended, _, info = self._env.step(cut)
+            self._steps += 1
+            self._succeeded |= bool(self.map.success(float(reward), ended, info))
 
     def is_beyond_limits(self, action: Action) -> bool:
         return False

@@ -7,7 +7,6 @@ in it, too.
 
 import logging
 import os
-import time
 import warnings
 import weakref
 from collections.abc import Iterator, Sequence
@@ -32,6 +31,7 @@ from vap_core.simulation.assets.objects import ObjectModel, extent_m, get_object
 from vap_core.simulation.assets.shapes import Hull, Mesh
 from vap_core.simulation.contacts import contact_partners
 from vap_core.simulation.control import BEYOND, rotation_vector
+from vap_core.simulation.env import timed
 from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import (
     EE_ACTION,
@@ -412,7 +412,7 @@ class LiberoEnv:
         return self._views(longer_px)
 
     def _views(self, side: int) -> Views:
-        with self._timed("render"):
+        with timed(self.seconds, "render"):
             renderer = self.world.renderer(self._model, side)
             views = {}
             for name in self.camera_names:
@@ -434,7 +434,7 @@ class LiberoEnv:
     def step(self, action: Action) -> None:
         """LIBERO's controller takes shares of its longest step, and a gripper from -1 (open)."""
         share = np.clip(self._shares(action), -1.0, 1.0)
-        with self._timed("physics"):
+        with timed(self.seconds, "physics"):
             self._libero.step(np.array([*share, 1.0 - 2.0 * action[-1]]))
         self._steps += 1
         pressed = self._touching(self._hand)
@@ -453,7 +453,7 @@ class LiberoEnv:
         return sorted({*self._roles[pairs].ravel()} - {ROBOT, REST})
 
     def truth(self, masks: bool = False) -> Truth:
-        with self._timed("truth"):
+        with timed(self.seconds, "truth"):
             data = self._data
             seen: dict[str, dict[str, Mask]] = {}
             hand: dict[str, Mask] = {}
@@ -499,14 +499,6 @@ class LiberoEnv:
             camera.pose_world[:3, 3] -= self.world.origin_m
             found.append(camera)
         return tuple(found)
-
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] += time.perf_counter() - start
 
 
 def _pose7(pose: Float64[np.ndarray, "4 4"]) -> Pose:

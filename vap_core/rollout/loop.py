@@ -8,7 +8,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -65,11 +65,11 @@ from vap_core.rollout.types import (
     mask_coverage,
 )
 from vap_core.simulation.control import BEYOND
-from vap_core.simulation.env import Control, Env
+from vap_core.simulation.env import Control, Env, timed
 from vap_core.simulation.looks import PERFECT, Sensor
 from vap_core.simulation.occluder import Occlusion
 from vap_core.simulation.scenes import Scene
-from vap_core.simulation.suites.open_row import cameras_of
+from vap_core.simulation.suites.open_row import cameras_of, models_of
 from vap_core.simulation.suites.rules import Judge
 from vap_core.simulation.types import EpisodeRow, Observation
 
@@ -181,11 +181,9 @@ def _env(trial: Trial, row: EpisodeRow) -> Environment:
     Its scene holds what the row places and no more: the last bits of the physics depend on every
     object in a scene, and an episode must not depend on the rows beside it.
     """
-    scene = trial.scene
-    if isinstance(scene, Scene):
-        scene = scene.only([place.model for place in row.placements])
+    shared = trial.scene
     return open_env(
-        scene,
+        shared.only(models_of([row])) if isinstance(shared, Scene) else shared,
         cameras_of(row),
         image_size=trial.image_size,
         control=trial.control,
@@ -273,7 +271,7 @@ def _start_prompting(trial: Trial, episode: RunningEpisode, observation: Observa
         return unchanged(observation.images, episode.goal.instruction)
     context = _context(trial, episode)
     drawn_s = episode.env.seconds["render"]
-    with _timed(episode.seconds, "attend"):
+    with timed(episode.seconds, "attend"):
         shown = _shown(observation)
         started = [trial.prompter.start(shown, context)]
         [(state, attended)] = checked_steps(started, trial.prompter, [shown], "start")
@@ -343,7 +341,7 @@ def _open_sink(
     trial: Trial, episode: RunningEpisode, attended: Attended, sink: OpenSink | None
 ) -> None:
     episode.header = _header(trial, episode, attended)
-    with _timed(episode.seconds, "record"):
+    with timed(episode.seconds, "record"):
         episode.sink = sink(episode.header) if sink is not None else None
     redraws = isinstance(episode.env, Env) and not episode.row.subgoals
     if redraws and isinstance(episode.sink, WaitingSink):
@@ -367,7 +365,7 @@ def _open_subgoal(episode: RunningEpisode, attended: Attended) -> None:
     )
     episode.spans.append(SubGoalSpan(header, episode.judge.steps))
     if episode.stage and isinstance(episode.sink, SubGoalSink):
-        with _timed(episode.seconds, "record"):
+        with timed(episode.seconds, "record"):
             episode.sink.begin_subgoal(header)
 
 
@@ -517,7 +515,7 @@ def _act(
         episode.outcome = ending(episode, detail=note)
     episode.attention = {}
     episode.notes = []
-    with _timed(episode.seconds, "record"):
+    with timed(episode.seconds, "record"):
         if episode.sink is not None:
             episode.sink.frame(frame)
     episode.frames.append(frame if keep_images else frame.without_images())
@@ -529,7 +527,7 @@ def _act(
 
 def _end(trial: Trial, episode: RunningEpisode) -> Episode:
     assert episode.outcome is not None
-    with _timed(episode.seconds, "record"):
+    with timed(episode.seconds, "record"):
         if episode.sink is not None:
             _guard(episode, episode.sink.close, episode.outcome)
     if isinstance(episode.env, Env):
@@ -581,12 +579,3 @@ def _ends_the_run(error: BaseException) -> bool:
     """
     of_episode = isinstance(error, OutOfReach | BadAction | BadCrop | BadPart | BadPlan)
     return isinstance(error, VapError) and not of_episode
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[part] += time.perf_counter() - start

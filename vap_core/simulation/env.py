@@ -224,7 +224,7 @@ class Env:
         return max(1, round(height * scale)), max(1, round(width * scale))
 
     def _views(self, hw: tuple[int, int], samples: int = 0) -> Views:
-        with self._timed("render"):
+        with timed(self.seconds, "render"):
             light = Light(self.row.start.lamp, self.row.start.ambient)
             size = hw
             if self._step() == 0:
@@ -266,11 +266,11 @@ class Env:
             raise BadAction(
                 f"Env.step: {action.tolist()} holds numbers that are not finite; fix the policy."
             )
-        with self._timed("ik"):
+        with timed(self.seconds, "ik"):
             before = self._targets(self._command.joints, self._command.gripper)
             self._command = self.commanded(self._command, action)
         after = self._targets(self._command.joints, self._command.gripper)
-        with self._timed("physics"):
+        with timed(self.seconds, "physics"):
             ramp = np.linspace(0.0, 1.0, self._substeps + 1)[1:, None]
             self._advance(before + ramp * (after - before))
 
@@ -288,7 +288,7 @@ class Env:
 
     def truth(self, masks: bool = False) -> Truth:
         """Ground truth after the last step, on demand with every camera's visible object masks."""
-        with self._timed("truth"):
+        with timed(self.seconds, "truth"):
             masks_by_camera: dict[str, Mapping[str, Mask]] = {}
             hand: dict[str, Mask] = {}
             for name in self.camera_names if masks else ():
@@ -440,14 +440,16 @@ class Env:
         """What a picture lacks and has: objects that are not on the table, and the occluder."""
         return {"hidden": frozenset(self._parked), "before": self._screens(camera)}
 
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] += time.perf_counter() - start
-
 
 def _qpos_addresses(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:
     return np.array([model.joint(name).qposadr[0] for name in joints])
+
+
+@contextmanager
+def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Add the wall time of the block to `seconds[part]`, also where the block raises."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[part] += time.perf_counter() - start

@@ -4,7 +4,7 @@ The world frame stands on the table top
 (z = 0) at the robot's base: x away from the robot, y to its left, z up; metres.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Literal, get_args
 
@@ -36,7 +36,7 @@ class Scene:
     """
 
     robot: Robot
-    models: "tuple[objects.ObjectModel, ...]"
+    models: "Mapping[str, objects.ObjectModel]"
     style: SceneStyle
     meshes: Meshes
     model: mujoco.MjModel
@@ -54,16 +54,9 @@ class Scene:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def only(self, names: Sequence[str]) -> "Scene":
-        """A scene like this one with only the objects of these names, in their order.
-
-        Raises: UnknownName for an object that this scene lacks.
-        """
-        held = {model.name: model for model in self.models}
-        for name in names:
-            if name not in held:
-                raise one_of("Scene.only: object", name, held)
-        models = [held[name] for name in dict.fromkeys(names)]
+    def only(self, names: Iterable[str]) -> "Scene":
+        """A scene like this one with those of its objects that are named, in the order of names."""
+        models = [self.models[name] for name in names if name in self.models]
         return build(self.robot.name, models, style=self.style, meshes=self.meshes)
 
     def close(self) -> None:
@@ -98,20 +91,22 @@ def build(
     base.pos = arm.base_world[:3]
     base.quat = arm.base_world[3:]
     _add_room(spec, arm, style)
-    held = tuple(objects.get_object(model) if isinstance(model, str) else model for model in models)
-    for i, model in enumerate(held):
+    held: dict[str, objects.ObjectModel] = {}
+    for i, model in enumerate(models):
+        if isinstance(model, str):
+            model = objects.get_object(model)
         add_object(spec, model, parked(arm, i))
-    sizes_m = {model.name: objects.extent_m(model) for model in held}
+        held[model.name] = model
     cameras = add_rigs(spec, robot, style.camera_shift_m)
     compiled = spec.compile()
-    renderer = Renderer(compiled, tuple(sizes_m), style.shadows)
+    renderer = Renderer(compiled, tuple(held), style.shadows)
     return Scene(
         robot=arm,
         models=held,
         style=style,
         meshes=meshes,
         model=compiled,
-        sizes_m=sizes_m,
+        sizes_m={name: objects.extent_m(model) for name, model in held.items()},
         cameras=cameras,
         renderer=renderer,
     )

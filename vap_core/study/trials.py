@@ -499,9 +499,8 @@ def _token_embedding(
 def _scene(study: Study, rows: Sequence[EpisodeRow]) -> AnyScene:
     """The scene of what some rows of one task and variant place; the last one is kept."""
     first = rows[0]
-    names = models_of(rows)
     elsewhere = first.task if suites.suite(first.suite).environment else ""
-    key = (first.suite, tuple(names), first.variant, study.robots, elsewhere)
+    key = (first.suite, tuple(models_of(rows)), first.variant, study.robots, elsewhere)
     if key not in _last_scene:
         for scene in _last_scene.values():
             scene.close()

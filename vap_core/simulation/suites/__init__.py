@@ -60,8 +60,8 @@ def suite(name: str) -> Suite:
         return own_suite.suite
     if not is_listed(name):
         raise one_of(
-            "suites.suite: suite (a benchmark also with -dev, -red, -twins, -absent, -dev-absent; "
-            f"your own by its file or {own.VARIABLE})",
+            "suites.suite: suite (a benchmark also with -dev, -red, -twins, -absent; your own by "
+            f"its file or {own.VARIABLE})",
             name,
             [*SUITES, *ELSEWHERE],
         )
@@ -86,7 +86,7 @@ def is_listed(name: str) -> bool:
 
     A shared scene has one, too.
     """
-    if name.endswith(f"{DEVELOPMENT}{TWINS}"):  # a development list has its own look-alikes
+    if name.endswith(DEVELOPMENT + TWINS):  # a development list has its own look-alikes
         return False
     return name in (*SHARED, *ELSEWHERE) or benchmark_name(name) in BENCHMARKS
 
@@ -147,10 +147,9 @@ def benchmark(name: str) -> tuple[EpisodeRow, ...]:
         left_out = replace(AS_LISTED, absent=True)
         whole = benchmark(name.removesuffix(ABSENT))
         return tuple(replace(row, suite=name, start=left_out) for row in whole)
-    if name.endswith(RED):
-        return tuple(_with_red_lookalike(row, name) for row in benchmark(name.removesuffix(RED)))
-    if name.endswith(TWINS):
-        return tuple(_with_twins(row, name) for row in benchmark(name.removesuffix(TWINS)))
+    for ending in (RED, TWINS):
+        if name.endswith(ending):
+            return tuple(_with_others(row, name) for row in benchmark(name.removesuffix(ending)))
     own_suite = _find_own(name)
     if own_suite is not None:
         return own_suite.rows
@@ -252,28 +251,20 @@ def listed(
     return tuple(episodes)
 
 
-def _with_red_lookalike(row: EpisodeRow, name: str) -> EpisodeRow:
-    """The row with its first look-alike red by nature, in its place."""
-    placements = list(row.placements)
-    for i, place in enumerate(placements):
-        if (
-            i
-            and place.model != row.goal
-            and objects.get_object(place.model).category == row.category
-        ):
-            placements[i] = replace(place, model=f"{place.model}{RED}")
-            break
+def _with_others(row: EpisodeRow, name: str) -> EpisodeRow:
+    """The row of -red or -twins: other look-alikes in the places of its own."""
+    alike = [
+        place.model
+        for place in row.placements[1:]
+        if objects.get_object(place.model).category == row.category
+    ]
+    if name.endswith(RED):
+        others: Iterable[str] = (f"{alike[0]}{RED}", *alike[1:])
+    else:
+        others = shared.hardest(row.target.removesuffix("-personal"))[:: (-1) ** row.episode]
+    new = dict(zip(alike, others, strict=True))
+    placements = [replace(each, model=new.get(each.model, each.model)) for each in row.placements]
     return replace(row, suite=name, placements=tuple(placements))
-
-
-def _with_twins(row: EpisodeRow, name: str) -> EpisodeRow:
-    """The row with the two hardest look-alikes in the places of those that it draws."""
-    twins = iter(shared.hardest(row.target.removesuffix("-personal"))[:: (-1) ** row.episode])
-    placements = tuple(
-        replace(place, model=next(twins)) if "-lookalike-" in place.model else place
-        for place in row.placements
-    )
-    return replace(row, suite=name, placements=placements)
 
 
 def _check_names(names: set[str], known: set[str], where: str) -> None:

@@ -23,28 +23,28 @@ from vap_core.simulation.suites.suite import Suite, Task
 from vap_core.simulation.types import Owned, SubGoal, SuccessRule
 
 SPEAKER = "anna"
-HARDEST: dict[str, tuple[int, int]] = {
-    "bottle": (3, 4),
-    "camera": (5, 3),
-    "cat-figurine": (3, 1),
-    "cup": (2, 1),
-    "leather-bag": (1, 2),
-    "miniature-house": (1, 3),
-    "owl-figurine": (2, 4),
-    "paper-cup": (2, 1),
-    "pen-holder": (3, 4),
-    "plant": (3, 2),
-    "plushie": (1, 4),
-    "pouch": (1, 2),
-    "scrubber": (1, 2),
-    "shaver": (2, 5),
-    "shoe": (3, 1),
-    "slipper": (1, 2),
-    "straw-cup": (2, 4),
-    "stuffed-toy": (1, 2),
-    "vase": (5, 2),
+HARDEST = {
+    "bottle": "34",
+    "camera": "53",
+    "cat-figurine": "31",
+    "cup": "21",
+    "leather-bag": "12",
+    "miniature-house": "13",
+    "owl-figurine": "24",
+    "paper-cup": "21",
+    "pen-holder": "34",
+    "plant": "32",
+    "plushie": "14",
+    "pouch": "12",
+    "scrubber": "12",
+    "shaver": "25",
+    "shoe": "31",
+    "slipper": "12",
+    "straw-cup": "24",
+    "stuffed-toy": "12",
+    "vase": "52",
 }
-"""The two look-alikes of greatest mean cosine with the personal instance's photos, by stem."""
+"""Numbers of the two look-alikes of greatest mean cosine with the personal object's photos."""
 BOWL = benchmarks.BOWL
 PLATE = "plate-prop"
 BASKET = "basket-prop"
