@@ -83,7 +83,12 @@ class Recipe(Sizes):
 
 
 RECIPES: dict[str, Recipe] = {
-    "simpler-bridge": Recipe(suite="simpler-bridge", held_out_category="owl figurine"),
+    "simpler-bridge": Recipe(
+        suite="simpler-bridge",
+        held_out_category="owl figurine",
+        stages=960,
+        steps=9_600,
+    ),
     "simpler-fractal": Recipe(
         suite="simpler-fractal",
         held_out_category="bottle",
@@ -128,10 +133,10 @@ class Filmed:
 
     The suite's tasks without the held-out category, and `instead` of them the same skill with
     categories that the suite does not evaluate. Objects stand in `area`. There is a picture
-    `every` so many control steps: at 30 Hz neighbours hardly differ, and pictures are what a film
-    costs. At most `most` objects of the category and the goal are in a scene; `distractors` is the
-    share of scenes with one or two objects of other categories besides. With `pairs`, the goal is
-    an object like the target (`films.pairs`).
+    `every` so many control steps: neighbours hardly differ, and pictures are what a film costs and
+    fill the memory. At most `most` objects of the category and the goal are in a scene;
+    `distractors` is the share of scenes with one or two objects of other categories besides. With
+    `pairs`, the goal is an object like the target (`films.pairs`).
     """
 
     area: Area
@@ -158,6 +163,7 @@ FILMED: dict[str, Filmed] = {
     "simpler-bridge": Filmed(
         area=FILMED_AREA,
         instead=(_instead(BRIDGE.task("put-owl-figurine"), "vase"),),
+        every=2,
         most=4,
     ),
     "simpler-fractal": Filmed(
