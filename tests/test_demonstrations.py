@@ -34,7 +34,7 @@ from vap_make.vlm.questions import MIN_ASKED_PX, ask, place
 from vap_make.words import pattern_words, vocabulary
 
 SUITE = "simpler-bridge"
-RECIPE = RECIPES[SUITE]
+RECIPE = replace(RECIPES[SUITE], thin=1)
 
 
 @pytest.fixture(scope="module")

@@ -138,9 +138,8 @@ def draw_models(
             models.append(generic_instance(task.stem, int(i)))
     kinds = [kind for kind in DISTRACTORS if kind != task.category]
     # Left out after the draw, which every later one hangs on.
-    unseen = RECIPES[known.name].held_out_category
-    seen = [kind for kind in rng.permutation(kinds) if kind != unseen]
-    for kind in seen[:distractors]:
+    left = rng.permutation(kinds)
+    for kind in left[left != RECIPES[known.name].held_out_category][:distractors]:
         index = pool[int(rng.integers(len(pool)))]
         models.append(generic_instance(str(kind), index))
     return models
@@ -272,6 +271,13 @@ def after_a_miss(film: Film) -> bool:
     """Whether the film begins with a second try: its hand begins far below its highest point."""
     height = film.state[:, 2]
     return bool(height[0] + LOW_M < height.max())
+
+
+def thinned(films: Sequence[Film], n: int) -> list[Film]:
+    """The films with one picture in `n`, from the first on."""
+    return [
+        replace(film, images=film.images[::n].copy(), ids=film.ids[::n].copy()) for film in films
+    ]
 
 
 def small(rgb: Rgb) -> UInt8[np.ndarray, "s s 3"]:

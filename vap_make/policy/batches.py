@@ -20,7 +20,7 @@ from vap_core.simulation.suites import suite
 from vap_make.films.demonstrations import Film
 from vap_make.patches import patch_shares
 from vap_make.policy.commands import Command, Known, Seen, colours_of, command
-from vap_make.recipe import Recipe, every
+from vap_make.recipe import Recipe
 
 AROUND = 4
 """Pictures from a change of the gripper that `focus` still calls close."""
@@ -107,7 +107,7 @@ class Frames:
         self.config = config
         self.known = known
         benchmark = suite(recipe.suite)
-        self.interval = every(recipe.suite)
+        self.interval = recipe.interval
         self.turns = benchmark.control == "ee"
         self.turn_rad = TURN_RAD_S / benchmark.hz
         self.number = {word: i for i, word in enumerate(config.words)}

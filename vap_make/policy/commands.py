@@ -29,7 +29,7 @@ from vap_make.colours import seen, stands_out
 from vap_make.films.captions import distinguishes
 from vap_make.films.demonstrations import Film
 from vap_make.policy.tints import Images, draw_tints, tint_views
-from vap_make.recipe import FILMED, Recipe, every, filmed_task
+from vap_make.recipe import FILMED, Recipe, filmed_task
 from vap_make.words import DETERMINERS
 
 AFTERWARDS = 0.15
@@ -127,7 +127,7 @@ def command(
         if not near(film, t, recipe.suite, things[1:]):
             return None
         text = phrase_instruction(task, "", rng)
-    picture = t // every(recipe.suite)
+    picture = t // recipe.interval
     images = film.images[picture]
     if tints:
         owned = {things[i]: colour for i, colour in tints.items()}

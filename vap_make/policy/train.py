@@ -41,7 +41,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import suite
 from vap_make.films.captions import captions
 from vap_make.films.dataset import about, data_sha256, read, shoot_stages
-from vap_make.films.demonstrations import SIDE, Film, cached, stage_file
+from vap_make.films.demonstrations import SIDE, Film, cached, stage_file, thinned
 from vap_make.films.scenes import CACHE, only_generic
 from vap_make.folder import SAVING, cost_s, training_folder
 from vap_make.patches import model_options
@@ -133,8 +133,10 @@ def load_films(
     """
     if demonstrations is not None:
         origin(demonstrations, recipe.suite)
-        kept = read(demonstrations, lambda stage: not _is_held_out(stage))
-        return Films(kept, read(demonstrations, _is_held_out))
+        return Films(
+            thinned(read(demonstrations, lambda stage: not _is_held_out(stage)), recipe.thin),
+            thinned(read(demonstrations, _is_held_out), recipe.thin),
+        )
     folder = cache / FILMS
     shoot_stages(recipe.suite, recipe.stages, folder, seed=recipe.seed, jobs=jobs)
     films: list[Film] = []
@@ -142,7 +144,7 @@ def load_films(
     spent_s = 0.0
     for stage in range(recipe.stages):
         part = held_out if _is_held_out(stage) else films
-        part += cached(folder, recipe.suite, recipe.seed, stage)
+        part += thinned(cached(folder, recipe.suite, recipe.seed, stage), recipe.thin)
         spent_s += cost_s(stage_file(folder, recipe.suite, recipe.seed, stage))
     return Films(films, held_out, spent_s)
 
