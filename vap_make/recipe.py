@@ -61,9 +61,9 @@ class Recipe(Sizes):
 
     suite: str
     held_out_category: str
-    stages: int = 320
-    thin: int = 1
-    steps: int = 6_400
+    stages: int = 960
+    thin: int = 2
+    steps: int = 9_600
     batch: int = 64
     chunk: int = 4
     execute: int = 4
@@ -92,7 +92,7 @@ class Recipe(Sizes):
 TABLETOP = Recipe(
     suite="tabletop",
     held_out_category="slipper",
-    stages=240,
+    stages=480,
     batch=32,
     rate=1e-3,
     angle_noise_rad=0.04,
@@ -100,23 +100,18 @@ TABLETOP = Recipe(
     execute=10,
 )
 RECIPES: dict[str, Recipe] = {
-    "simpler-bridge": Recipe(
-        suite="simpler-bridge",
-        held_out_category="owl figurine",
-        stages=960,
-        thin=2,
-        steps=9_600,
-    ),
+    "simpler-bridge": Recipe(suite="simpler-bridge", held_out_category="owl figurine"),
     "simpler-fractal": Recipe(
         suite="simpler-fractal",
         held_out_category="bottle",
-        steps=5_100,
+        steps=7_600,
         execute=2,
     ),
     "vlabench": Recipe(
         suite="vlabench",
         held_out_category="cat figurine",
         stages=240,
+        thin=1,
         steps=1_840,
         angle_noise_rad=0.01,
     ),
