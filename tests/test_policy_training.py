@@ -24,7 +24,7 @@ from vap_core.policies.mini_pi0.learned_token import TokenTraining
 from vap_core.policies.mini_pi0.vlm import load_vlm
 from vap_make.films import demonstrations
 from vap_make.films.dataset import data_sha256
-from vap_make.films.demonstrations import Film, cached
+from vap_make.films.demonstrations import Film, cached, thinned
 from vap_make.policy import losses, taught
 from vap_make.policy import train as policy
 from vap_make.policy.commands import Known
@@ -62,7 +62,7 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not_in_more_processe
     measured = "flow heat where hit turn goal_heat goal_where goal_hit"
     assert set(whole["held_out"]) == set(measured.split())
     assert whole["data_sha256"] == data_sha256(
-        [film for n in range(2) for film in cached(folder, SUITE, 0, n)]
+        [film for n in range(2) for film in thinned(cached(folder, SUITE, 0, n), recipe.thin)]
     )
     with pytest.raises(BadOutput, match=r"another recipe \(rate 0.0014 there, 0.1 now\)"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=cache)
