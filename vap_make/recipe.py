@@ -128,9 +128,9 @@ class Filmed:
     The suite's tasks without the held-out category, and `instead` of them the same skill with
     categories that the suite does not evaluate. Objects stand in `area`. There is a picture
     `every` so many control steps: at 30 Hz neighbours hardly differ, and pictures are what a film
-    costs. At most `most` objects of the category and the goal are in a scene;
-    `distractors` is the share of scenes with one or two objects of other categories besides. With
-    `pairs`, the goal is an object like the target (`films.pairs`).
+    costs. At most `most` objects of the category and the goal are in a scene; `distractors` is the
+    share of scenes with one or two objects of other categories besides. With `pairs`, the goal is
+    an object like the target (`films.pairs`).
     """
 
     area: Area
