@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +11,6 @@ from tests.command import refused
 from tests.toys import MeanColour, SameColour, segmenter
 from vap_core.base.errors import BadOutput
 from vap_core.base.types import Boxes
-from vap_core.cli import machine
 from vap_core.perception import protocols, stacks
 from vap_core.perception.foundation import weights as hub
 from vap_core.perception.protocols import Stack, Thresholds
@@ -290,15 +288,3 @@ def test_ground_says_that_a_stack_cannot_say_not_in_view(monkeypatch):
     assert "calibration --stack toy --keep" in grounding.missing_threshold("toy")
     monkeypatch.setitem(stacks.STACKS, "toy", lambda: replace(TOY, thresholds=Thresholds(0.5, 0.5)))
     assert grounding.missing_threshold("toy") == ""
-
-
-def test_doctor_says_which_stacks_cannot_say_not_in_view(tmp_path: Path, monkeypatch):
-    monkeypatch.setenv(hub.VARIABLE, str(tmp_path))
-    finding = machine._not_in_view()
-    assert not finding.works
-    assert not finding.needed
-    assert "foundation, foundation-small: no threshold" in finding.detail
-    assert "calibration --stack foundation --keep" in finding.detail
-    for kind in ("foundation", "foundation-small"):
-        protocols.keep_thresholds(tmp_path, kind, "dino", Thresholds(0.5, 0.5))
-    assert machine._not_in_view().works

@@ -348,14 +348,14 @@ def test_a_hand_in_the_bounding_box_that_touches_nothing_has_reached_it():
     assert told("selected", still(3) + still(3, where=INSIDE)).sentence == f"{words} at step 3"
     strayed = still(1, now=truth(touched=(OTHER,)), where=INSIDE)
     found = told("selected", still(3) + strayed)
-    assert found.sentence == f"touches {OTHER} and {words} at step 3"
+    assert found.sentence == f"touches {OTHER} at step 3 and {words}"
     almost = (0.3, 0.0, 0.0742)
     found = told("selected", [*still(3), (truth(touched=(OTHER,)), (RIGHT,), almost, 1.0)])
-    assert found.sentence == f"touches {OTHER} and {words} at step 3", "0.4 cm were once 0 cm"
+    assert found.sentence == f"touches {OTHER} at step 3 and {words}", "0.4 cm were once 0 cm"
     beside = told("selected", still(3) + still(3, where=NEAR)).sentence
-    assert beside == f"comes no closer to {TARGET} than 1.0 cm at step 3"
+    assert beside == f"comes no closer to {TARGET} than 1 cm at step 3"
     afar = told("selected", still(3) + still(1, now=truth(touched=(OTHER,)))).sentence
-    assert afar == f"touches {OTHER} and comes no closer to {TARGET} than 43 cm at step 3"
+    assert afar == f"touches {OTHER} at step 3 and comes no closer to {TARGET} than 43 cm"
 
 
 def test_touching_the_goal_is_no_mistake():

@@ -403,18 +403,20 @@ def run_episode(
     return episode
 
 
-def animate(films: Mapping[str, Sequence[Rgb]], path: Path, side_px: int = 320) -> None:
+def animate(films: Mapping[tuple[str, str], Sequence[Rgb]], path: Path) -> None:
     """Films side by side as a GIF of eight pictures a second, each below its caption.
 
-    A film that ends earlier stays at its last picture.
+    A film that ends earlier stays at its last picture, whose caption has the second text, too.
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    font = ImageFont.load_default(size=17)
+    font, side_px = ImageFont.load_default(size=17), 320
     pages = []
     for i in range(max(map(len, films.values()))):
         page = Image.new("RGB", (len(films) * (side_px + 8) - 8, side_px + 28), "white")
-        for at, (caption, pictures) in enumerate(films.items()):
+        for at, ((caption, end), pictures) in enumerate(films.items()):
+            if i + 1 >= len(pictures):
+                caption += end
             shown = Image.fromarray(pictures[min(i, len(pictures) - 1)])
             page.paste(shown.resize((side_px, side_px)), (at * (side_px + 8), 28))
             ImageDraw.Draw(page).text((at * (side_px + 8) + 2, 4), caption, "black", font)

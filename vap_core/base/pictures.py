@@ -268,7 +268,7 @@ def vote_picture(
         words += "; yours is none of them"
     draw.text((6, y + cell_px / 4), words, fill=ink, font=bold, anchor="lm")
     _dot(draw, (0, y + 0.55 * cell_px), cell_px)
-    key = "the vote of a photo: the row most like it (cosines, bright: alike)"
+    key = "a photo's vote; bright: more alike"
     draw.text((cell_px, y + 0.75 * cell_px), key, fill=ink, font=font, anchor="lm")
     drawn = np.array(picture)
     _write(drawn, texts, cell_px)

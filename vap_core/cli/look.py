@@ -43,7 +43,7 @@ def diagnose(
             help='SQL condition on the columns of the table: "margin < 0.3 and steps > 20".'
         ),
     ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="Failures to list.")] = 20,
+    limit: Annotated[int, typer.Option(min=1, help="Failures to list.")] = 8,
     show: Annotated[
         int | None,
         typer.Option(
@@ -327,7 +327,7 @@ def report(
         beside = Path("data/runs") / f"{runs[0].stem}-report"
     folder = out or beside
     print(conclude(runs, folder))
-    print(f"\nwrote {folder}: report.md, report.html, tables as CSV, pictures")
+    print(f"\nwrote {folder}: report.md, tables as CSV, pictures\nopen {folder}/report.html")
 
 
 @app.command()

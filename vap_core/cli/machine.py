@@ -64,7 +64,7 @@ def doctor() -> None:
     needed = (_python, _gl, _weights, _lists, _rerun)
     others = (_pictures, _text_encoder, _torch, _gpu, _lerobot, _menagerie)
     checks = [_run_check(check, needed=check in needed) for check in (*needed, *others)]
-    findings = [*checks, _viewer(), *_foundation(), _not_in_view()]
+    findings = [*checks, _viewer(), *_foundation()]
     print(*findings, sep="\n")
     if any(finding.needed and not finding.works for finding in findings):
         raise typer.Exit(1)
@@ -216,23 +216,6 @@ def _foundation() -> list[Finding]:
             detail = f"{len(missing)} of {len(models)} models missing; {remedy(kind)}"
         findings.append(Finding(f"stack {kind}", not missing, detail, needed=False))
     return findings
-
-
-def _not_in_view() -> Finding:
-    """Whether every foundation stack can say that an object is not in view."""
-    from vap_core.perception.foundation.weights import KINDS, store_folder
-    from vap_core.perception.protocols import keep_command, thresholds_file
-    from vap_core.perception.stacks import EMBEDDED_THRESHOLDS
-
-    lacking = [kind for kind in KINDS if not thresholds_file(store_folder(), kind).is_file()]
-    cosines = f"{EMBEDDED_THRESHOLDS.familiar:g}, {EMBEDDED_THRESHOLDS.unfamiliar:g}"
-    detail = f"embedded: cosine below {cosines}"
-    if lacking:
-        detail += (
-            f"; {', '.join(lacking)}: no threshold, so the best candidate is always highlighted; "
-            f"{keep_command(lacking[0], photos=False)} measures one"
-        )
-    return Finding('"not in view"', not lacking, detail, needed=False)
 
 
 @weights.command("list")

@@ -24,7 +24,7 @@ CAUSES = {
     "case 1": "wrong mask (Case 1): ",
     "case 2": "views disagree (Case 2): ",
     "case 3": "right prompt, failed hand (Case 3): ",
-    "unprompted": "no prompt: ",
+    "unprompted": "unprompted: ",
 }
 
 

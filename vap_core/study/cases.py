@@ -362,8 +362,8 @@ def _wrong_object(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
     reached = trace.rule != "selected" and (trace.gap_m <= thresholds.near_m).any()
     if strayed is not None and touched is None and not reached:
         name = trace.others[strayed][0]
-        sentence = f"touches {name} and {_closest_words(trace, digits=0)}"
-        return _diagnosis(trace, "wrong object", strayed, sentence, object=name)
+        more = f" and {_closest_words(trace)}"
+        return _diagnosis(trace, "wrong object", strayed, f"touches {name}", more, object=name)
     return None
 
 
@@ -400,6 +400,9 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
         sentence = f"touches but does not grasp {trace.target}{_distance_words(trace, at)}"
     else:
         return None
+    if any(trace.others[:at]):
+        names = next(filter(None, trace.others))
+        sentence = f"touches {names[0]} first, then {sentence}"
     return _diagnosis(trace, "missed grasp", at, sentence)
 
 
@@ -409,24 +412,29 @@ def _distance_words(trace: EpisodeTrace, at: int) -> str:
     return f" ({gap_mm} mm from its bounding box)" if gap_mm else ""
 
 
-def _closest_words(trace: EpisodeTrace, digits: int) -> str:
+def _closest_words(trace: EpisodeTrace) -> str:
     """How close the tcp comes to the bounding box of the target, which the hand never touches."""
-    closest_cm = f"{100 * trace.gap_m.min():.{digits}f}"
-    if float(closest_cm) == 0:
+    closest_cm = round(100 * trace.gap_m.min())
+    if not closest_cm:
         return f"reaches {trace.target} and does not touch it"
     return f"comes no closer to {trace.target} than {closest_cm} cm"
 
 
 def _timeout(trace: EpisodeTrace) -> Diagnosis:
     closest = int(np.argmin(trace.gap_m))
-    sentence = _closest_words(trace, digits=1)
+    sentence = _closest_words(trace)
     if any(trace.touches):
         sentence = f"does not complete the task after it touches {trace.target}"
     return _diagnosis(trace, "timeout", closest, sentence)
 
 
 def _diagnosis(
-    trace: EpisodeTrace, sub_case: str, at: int, sentence: str, **evidence: float | str
+    trace: EpisodeTrace,
+    sub_case: str,
+    at: int,
+    sentence: str,
+    more: str = "",
+    **evidence: float | str,
 ) -> Diagnosis:
     distances = {
         "gap_m": float(trace.gap_m[at]),
@@ -440,7 +448,7 @@ def _diagnosis(
         camera="",
         evidence={**distances, **evidence},
         confidence=1.0,
-        sentence=f"{sentence} at step {trace.steps[at]}",
+        sentence=f"{sentence} at step {trace.steps[at]}{more}",
     )
 
 

@@ -523,10 +523,10 @@ def _show_progress(
     counted |= fresh
     won = sum(row["success"] for row in rows)
     counts.setdefault(method, Counter()).update(success=won, n=len(fresh))
-    bar.update(len(fresh))
     rates = [
         f"{name} {100 * count['success'] / count['n']:.0f} % of {count['n']}"
         for name, count in sorted(counts.items())
         if count["n"]
     ]
-    bar.set_postfix_str(", ".join(rates))
+    bar.set_postfix_str(", ".join(rates), refresh=False)
+    bar.update(len(fresh))

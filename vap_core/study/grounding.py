@@ -269,7 +269,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
         cosine = grounding.similarity[i].mean()
         points = f"  points {candidates.verified[i]}" if candidates.verified is not None else ""
         lines.append(
-            f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  score {score:.2f}  "
+            f" {mark} #{i}  box {x0:4.0f} {y0:4.0f} {x1:4.0f} {y1:4.0f}  detector {score:.2f}  "
             f"votes {ballot.votes[i]}/{k}  mean cosine {cosine:.3f}{points}"
         )
     if grounding.rejected is not None:
@@ -286,7 +286,7 @@ def _format_grounding(grounding: Grounding) -> list[str]:
     tie = ", tie broken by mean cosine" if ballot.tied[winner] else ""
     measure = "cosine"
     if candidates.proof is not None:
-        measure = "score, which is the cosine and what points add"
+        measure = "cosine and what points add"
     lines.append(
         f"winner #{winner}, margin {ballot.margin:.2f} of the votes{tie}, "
         f"{ballot.cosine_margin:.3f} in {measure}"

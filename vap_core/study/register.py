@@ -389,8 +389,8 @@ class Trust:
             return "vote not checked: nothing else is remembered, and the photos show nothing else"
         text = (
             f"vote: each photo left out in turn, {self.right} of {self.n} are elected by the "
-            f"others against {self.others} crops of other objects and {self.background} of the "
-            f"background; least lead in cosine {self.margin:.2f}"
+            f"others against {number_of(self.others, 'crop')} of other objects and "
+            f"{self.background} of the background; least lead in cosine {self.margin:.2f}"
         )
         if self.by_name:
             text += f"; mistaken for {', '.join(self.by_name)}"

@@ -147,8 +147,8 @@ def _grasp_bars(trace: EpisodeTrace, frames: Sequence[Frame], level: float) -> l
     states = [grasp_state(frame, trace.target) for frame in frames]
     conditions = (
         ("hand_closed", MUTED, 2.6, trace.grip < CLOSED),
-        ("has_the_target", TARGET, 1.3, np.array([s.endswith("target") for s in states])),
-        ("has_another", LOOKALIKES[0], 1.3, np.array([s.endswith("other") for s in states])),
+        ("touches_the_target", TARGET, 1.3, np.array([s.endswith("target") for s in states])),
+        ("touches_another", LOOKALIKES[0], 1.3, np.array([s.endswith("other") for s in states])),
     )
     bars = []
     for name, colour, depth, flags in conditions:
