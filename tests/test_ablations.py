@@ -24,14 +24,11 @@ from vap_core.study import ablations as ablation_run
 from vap_core.study import logs, methods, paper
 from vap_core.study.ablations import (
     ablation_table,
-    across_policies,
     arm_folder,
     arm_table,
     effect_text,
     effects_figure,
     findings_table,
-    policies_figure,
-    policy_tables,
     rates_figure,
     shown_table,
     sweep_figure,
@@ -44,7 +41,6 @@ from vap_core.study.methods import (
     ARMS,
     METHODS,
     PUBLISHED,
-    TINT_SHARES,
     Ablation,
     Hidden,
     find,
@@ -136,7 +132,7 @@ def test_several_policies_of_a_suite_are_refused() -> None:
     ablation = ABLATIONS["rewrite"]
     of_one = pd.concat([outcomes("vap", [True] * 9), outcomes("mask-only", [False] * 9)])
     of_two = pd.concat([of_one, of_one.assign(policy="q")], ignore_index=True)
-    with pytest.raises(BadOutput, match=r"2 policies \(p, q\); name one.* policy_tables compares"):
+    with pytest.raises(BadOutput, match=r"2 policies \(p, q\); name one: keep its rows alone"):
         arm_table(ablation, of_two)
     other_arm = outcomes("generic", [True] * 9).assign(policy="q")
     beside = pd.concat([of_one, other_arm, of_two.assign(suite="vlabench", method="vap")])
@@ -188,7 +184,7 @@ def test_without_a_name_ablations_are_listed_and_unknown_ones_refused() -> None:
     listed = vap("ablate")
     assert listed.returncode == 0
     assert all(name in listed.stdout for name in ABLATIONS)
-    assert "ablation 'shape' is unknown; known: tint-share, association, colour, form" in refused(
+    assert "ablation 'shape' is unknown; known: association, colour, form" in refused(
         "ablate", "shape"
     )
 
@@ -207,28 +203,13 @@ def test_the_command_says_what_it_found_and_runs_nothing_twice(tmp_path: Path) -
 @pytest.mark.sweep
 @pytest.mark.parametrize(
     "name",
-    sorted(set(ABLATIONS) - {"selection", "association", "language", "colour", "tint-share"}),
+    sorted(set(ABLATIONS) - {"selection", "association", "language", "colour"}),
 )
 def test_every_ablation_runs(name: str, tmp_path: Path) -> None:
     # The scripted policy knows the palette's colour words alone, and needs a command and one view.
     done = vap("ablate", name, *WORDS, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert "0 errors" in done.stdout
-
-
-@pytest.mark.sweep
-def test_an_ablation_of_policies_runs_them_all(tmp_path: Path) -> None:
-    done = vap("ablate", "tint-share", "--suite", "widowx-pick", "--episodes", "1",
-               "--workers", "1", "--out", tmp_path / "run")  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "0 errors" in done.stdout
-    assert all(checkpoint in done.stdout for checkpoint in TINT_SHARES.values())
-    assert len(list((tmp_path / "run").glob("*/run.json"))) == len(TINT_SHARES) * 4
-    assert (tmp_path / "run" / "tint-share.png").stat().st_size > 5_000
-
-
-def test_an_ablation_of_policies_takes_no_other() -> None:
-    assert "leave --policy out" in refused("ablate", "tint-share", "--policy", "scripted")
 
 
 def test_the_track_is_kept_that_is_on_the_target_soon_after_it_is_seen_again() -> None:
@@ -537,39 +518,6 @@ def test_a_difference_that_rounds_to_no_point_has_one_sign_in_every_table() -> N
     assert table["difference [95 %]"][0] == "+0.0 [+0.0, +0.0]"
     assert signed(-0.4) == signed(0.4) == "+0"
     assert (signed(-0.6), signed(2.26, 1)) == ("-1", "+2.3")
-
-
-def test_policies_stand_side_by_side_and_each_is_compared_with_itself() -> None:
-    shares = ABLATIONS["tint-share"]
-    older, newer = (Path(shares.policies[label]).name for label in ("share-0", "share-0.5"))
-    episodes = pd.concat(
-        [
-            outcomes("vap", [True] * 9 + [False]).assign(policy=f"mini_pi0:{older}@00aa"),
-            outcomes("generic", [True] * 3 + [False] * 7).assign(policy=f"mini_pi0:{older}@00aa"),
-            outcomes("vap", [True] * 2 + [False] * 8).assign(policy=f"mini_pi0:{newer}@00bb"),
-            outcomes("generic", [False] * 10).assign(policy=f"mini_pi0:{newer}@00bb"),
-            outcomes("vap", [True] * 10).assign(policy=f"mini_pi0:{newer}-longer@00cc"),
-            outcomes("vap", [True] * 10).assign(policy=f"mini_pi0:{newer}@00bb, temperature 1"),
-        ],
-        ignore_index=True,
-    )
-    found = policy_tables(shares, episodes)
-    assert [(one.policy, one.arm, one.sr.k) for one in found.itertuples()] == [
-        ("share-0", "generic", 3),
-        ("share-0", "vap", 9),
-        ("share-0.5", "generic", 0),
-        ("share-0.5", "vap", 2),
-    ]
-    assert effect_text(found[found.policy == "share-0"], "vap").startswith("+60 [")
-    across = across_policies(shares, episodes)
-    assert [(one.arm, one.sr.k) for one in across.itertuples()] == [
-        ("share-0", 9),
-        ("share-0.5", 2),
-    ]
-    assert effect_text(across, "share-0.5").startswith("-70 [")
-    (axes,) = policies_figure(found, "share").axes
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["share-0", "share-0.5"]
-    assert sorted(round(bar.get_height()) for bar in axes.patches) == [0, 20, 30, 90]
 
 
 def test_arms_that_were_tried_and_left_count_in_the_correction() -> None:

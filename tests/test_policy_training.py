@@ -33,7 +33,7 @@ from vap_make.vlm import train as vlm
 
 SUITE = "simpler-bridge"
 SMALL = {"width": 32, "depth": 2, "vision_width": 32, "vision_depth": 1, "expert_width": 32}
-TINY = replace(RECIPES[SUITE], **SMALL)
+TINY = replace(RECIPES[SUITE], thin=1, **SMALL)
 
 
 def known(films: list[Film]) -> Known:
@@ -50,7 +50,7 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not_in_more_processe
     folder, _ = stage
     monkeypatch.setattr(demonstrations, "EPISODES", 2)
     monkeypatch.setattr(policy, "HELD_OUT", 2)
-    recipe = replace(TINY, stages=2, steps=3, batch=3, draws=2)
+    recipe = replace(TINY, stages=2, steps=3, batch=3, draws=2, thin=2)
     cache = folder.parent
     whole = policy.train(recipe, tmp_path / "whole", cache=cache, jobs=1)
     first = policy.train(recipe, tmp_path / "torn", cache=cache, minutes=0.0, jobs=2)
@@ -67,7 +67,6 @@ def test_a_training_that_was_stopped_ends_like_one_that_was_not_in_more_processe
     with pytest.raises(BadOutput, match=r"another recipe \(rate 0.0014 there, 0.1 now\)"):
         policy.train(replace(recipe, rate=0.1), tmp_path / "torn", cache=cache)
     assert whole["recipe"]["held_out_category"] == "owl figurine"
-    assert whole["recipe"]["tint_share"] == 0.0
     hours = whole["cpu_hours"]
     assert set(hours) == {"films", "captions", "vlm", "steps", "total"}
     assert hours["total"] == pytest.approx(sum(hours.values()) - hours["total"], abs=0.003)
@@ -231,8 +230,8 @@ def test_the_card_says_which_demonstrations_were_learned_from(
 
 def test_the_cost_of_a_model_whose_card_says_none_is_left_out() -> None:
     assert policy._vlm_cost_s(None) == 0.0
-    known_s = policy._vlm_cost_s(SHIPPED / "mini-paligemma-tint-free")
-    assert known_s == pytest.approx(0.46 * 3600, rel=0.02)
+    known_s = policy._vlm_cost_s(SHIPPED / "mini-paligemma")
+    assert known_s == pytest.approx(0.96 * 3600, rel=0.02)
 
 
 def test_stages_are_refused_beside_demonstrations(tmp_path: Path) -> None:
@@ -245,7 +244,7 @@ def test_stages_are_refused_beside_demonstrations(tmp_path: Path) -> None:
 def test_that_no_film_was_held_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     card = {"held_out": {}, "cpu_hours": {"total": 0.1}}
     monkeypatch.setattr(policy, "train", lambda *asked, **how: card)
-    words = ("train", "policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma-tint-free")
+    words = ("train", "policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma")
     assert vap(*words).stdout.startswith("no film was held out (every 19th stage is)")
     card["held_out"] = {"flow": 0.5}
     assert vap(*words).stdout.startswith('{\n "flow": 0.5\n}')
@@ -282,8 +281,8 @@ def test_a_model_that_is_whole_is_not_trained_again(
         (("perception",), "--cache"),
         (("vlm",), "--out"),
         (("vlm",), "--cache"),
-        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma-tint-free"), "--out"),
-        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma-tint-free"), "--cache"),
+        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma"), "--out"),
+        (("policy", "--suite", SUITE, "--vlm", SHIPPED / "mini-paligemma"), "--cache"),
         (("demonstrations", "--suite", SUITE), "--out"),
     ],
 )

@@ -47,7 +47,7 @@ from vap_make.vlm import train as vlm
 
 def test_a_model_that_ships_is_not_trained_over(tmp_path: Path) -> None:
     grown = copytree(SHIPPED / "mini-pi0-simpler-bridge-wide-seed-0", tmp_path / "mini-pi0")
-    root = copytree(SHIPPED / "mini-paligemma-tint-free", tmp_path / "mini-paligemma-tint-free")
+    root = copytree(SHIPPED / "mini-paligemma", tmp_path / "mini-paligemma")
     weights = [grown / "model.safetensors", root / "vlm.safetensors"]
     before = [sha256_of(path) for path in weights]
     with pytest.raises(BadOutput, match=r"holds a model without training\.pt.*another --out"):

@@ -20,13 +20,12 @@ from vap_make.colours import HUES_DEG, seen, similar, stands_out
 from vap_make.films import demonstrations
 from vap_make.films.demonstrations import Film
 from vap_make.policy import commands as language
-from vap_make.policy import tints
 from vap_make.policy.commands import Command, Form, Known, Seen, command
-from vap_make.recipe import RECIPES, TINTS, filmed_task
+from vap_make.recipe import RECIPES, filmed_task
 from vap_make.words import vocabulary
 
 SUITE, SIDE, THINGS = "simpler-bridge", 8, 40
-RECIPE = RECIPES[SUITE]
+RECIPE = replace(RECIPES[SUITE], thin=1)
 
 
 def look(rng: np.random.Generator) -> Description:
@@ -93,10 +92,8 @@ def commands(known: Known) -> list[Drawn]:
     return drawn(known, 4_000)
 
 
-def test_a_default_recipe_has_no_overlay(known: Known, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_recipe_has_an_overlay(known: Known) -> None:
     """No function of the recipe blends into a mask: what is drawn is the film, lighter or darker."""
-    for recipe in RECIPES.values():
-        assert recipe.tint_share == 0
     for module in (language, colours, demonstrations, objects):
         called = {
             node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
@@ -104,16 +101,12 @@ def test_a_default_recipe_has_no_overlay(known: Known, monkeypatch: pytest.Monke
             if isinstance(node, ast.Call)
         }
         assert called.isdisjoint({"tint", "addWeighted", "composite", "blend", "paste"}), module
-    monkeypatch.setattr(language, "tint_views", lambda *args: pytest.fail("tinted"))
     for shown, _, made in drawn(known, 300):
-        assert made.tints == {}
         gain = made.images.astype(float) / np.maximum(shown.images[0], 1)
         bright = (shown.images[0] > 60) & (made.images < 255)
         for channel in range(3):
             of = gain[..., channel][bright[..., channel]]
             assert of.max() - of.min() < 0.03, "one gain a channel, everywhere"
-    with pytest.raises(pytest.fail.Exception, match="tinted"):
-        drawn(known, 100, tint_share=1.0)
 
 
 def test_colour_words_are_those_of_pixels_and_stand_out(commands: list[Drawn]) -> None:
@@ -139,37 +132,6 @@ def test_a_look_says_nothing_about_other_forms(commands: list[Drawn], form: str)
     error = np.std(differences) / np.sqrt(len(differences))
     assert abs(np.mean(differences)) <= 3.5 * error
     assert error < 0.04
-
-
-def test_a_tinted_scene_tints_any_object_or_none(known: Known) -> None:
-    """A half of the scenes, and of them every object or none with equal odds, in no colour of VAP's."""
-    assert {colour.name for colour in TINTS}.isdisjoint({"magenta", "yellow"})
-    assert not {colour.rgb for colour in TINTS} & {colour.rgb for colour in PALETTE}
-    recipe = replace(RECIPE, tint_share=0.5)
-    rng = np.random.default_rng(4)
-    counts = np.zeros(4)
-    for _ in range(4_000):
-        made = tints.draw_tints(3, recipe, rng)
-        counts[next(iter(made), 3)] += 1
-        assert set(made.values()) <= set(TINTS)
-    assert counts[:3] == pytest.approx([500] * 3, abs=90)
-    made = [one for one in drawn(known, 400, tint_share=1.0) if one[2].tints]
-    named = [one for one in made if one[2].form == "coloured" and 0 in one[2].tints]
-    assert named
-    for _, _, one in named:
-        assert one.tints[0].name in one.text
-
-
-def test_a_tint_changes_masked_pixels_alone() -> None:
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (2, 12, 12, 3), np.uint8)
-    ids = (rng.random((2, 12, 12)) < 0.3).astype(np.uint8)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tints, "LOST", -1.0)
-        out = tints.tint_views(images, ids, {0: TINTS[0]}, rng)
-    assert (out[ids == 0] == images[ids == 0]).all()
-    far = np.abs(out[ids == 1] - np.array(TINTS[0].rgb, float)).sum()
-    assert far < 0.71 * np.abs(images[ids == 1] - np.array(TINTS[0].rgb, float)).sum()
 
 
 def test_colours_are_judged_by_pixels() -> None:
@@ -247,3 +209,11 @@ def test_every_suites_recipe_can_be_said_in_the_vocabulary() -> None:
         evaluated |= {get_object(task.goal).category for task in suite(name).tasks if task.goal}
         assert recipe.held_out_category in evaluated
         assert len(set(recipe.held_out_words) & {colour.name for colour in PALETTE}) == 2
+
+
+def test_a_film_that_is_not_thinned_as_the_recipe_says_is_refused(known: Known) -> None:
+    """Its pictures would be of earlier steps than the actions beside them."""
+    rng = np.random.default_rng(0)
+    shown = film(rng)
+    with pytest.raises(ValueError, match="not a picture every 2 steps"):
+        command(shown, 0, RECIPES[SUITE], known, painted(shown, rng), rng)

@@ -13,20 +13,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from vap_core.base.errors import one_of
-from vap_core.base.types import Colour
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
 from vap_core.simulation.suites.benchmarks import BRIDGE, FILMED_AREA, FRACTAL
 from vap_core.simulation.suites.layout import Area
 from vap_make.lists import benchmarks
-
-TINTS = (
-    Colour("orange", (255, 128, 0)),
-    Colour("purple", (128, 0, 255)),
-    Colour("pink", (255, 128, 192)),
-    Colour("cyan", (0, 160, 176)),
-)
-"""Tints of the policies that are taught any: no colour of the palette."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +37,7 @@ class Recipe(Sizes):
 
     Language: a command calls its target by the colour of its materials; `plain` and `described` are
     the shares of those that do not. `held_out_words` are in no command and on no object. `taught`
-    objects have a learned word, which `learned` of their commands use. A scene is tinted with the
-    odds `tint_share`, whatever the command: any object that may be meant carries the tint, or none,
-    with equal odds; the tints are TINTS.
+    objects have a learned word, which `learned` of their commands use.
 
     Films: none shows `held_out_category`, which the suite evaluates. `draws` flow samples share one
     look at the pictures; frames close to the start, a grasp, a release or the end come `focus`
@@ -72,7 +61,6 @@ class Recipe(Sizes):
     seed: int = 0
     focus: float = 3.0
     angle_noise_rad: float = 0.02
-    tint_share: float = 0.0
     held_out_words: tuple[str, ...] = ("magenta", "yellow")
     plain: float = 0.2
     described: float = 0.25

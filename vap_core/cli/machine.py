@@ -403,10 +403,6 @@ def policy(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of films, order and noise.")] = 0,
-    tint_share: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=1.0, help="Share of tinted scenes. Default the recipe's."),
-    ] = None,
     angle_noise: Annotated[
         float | None,
         typer.Option(
@@ -465,7 +461,7 @@ def policy(
     five CPU hours. Interrupted, the same command goes on.
 
     Example: ./vap train policy --suite simpler-bridge --stages 40 --steps 500
-        --vlm data/policies/mini-paligemma-tint-free --out data/runs/small-policy
+        --vlm data/policies/mini-paligemma --out data/runs/small-policy
     Example: ./vap train policy --suite simpler-fractal --seed 1 --device cuda
     """
     from dataclasses import replace
@@ -489,7 +485,6 @@ def policy(
     recipe = replace(
         standard,
         seed=seed,
-        tint_share=standard.tint_share if tint_share is None else tint_share,
         angle_noise_rad=standard.angle_noise_rad if angle_noise is None else angle_noise,
         stages=stages or standard.stages,
         steps=steps or standard.steps,

@@ -289,7 +289,7 @@ def ablate(asked: AskedOfAblation) -> None:
     Example: ./vap ablate form --suite simpler-bridge --episodes 6
     Example: ./vap ablate rewrite --suite simpler-fractal --split "visual matching"
     """
-    from vap_core.base.errors import BadStudy, one_of
+    from vap_core.base.errors import one_of
     from vap_core.study.methods import ABLATIONS
 
     name = asked.name
@@ -298,8 +298,7 @@ def ablate(asked: AskedOfAblation) -> None:
 
         rows = [["ablation", "question", "arms"]]
         for each, about in ABLATIONS.items():
-            of = f"; of the policies {', '.join(about.policies)}" if about.policies else ""
-            rows.append([each, about.question, ", ".join(about.names) + of])
+            rows.append([each, about.question, ", ".join(about.names)])
         print(printed(rows))
         print("next: ./vap ablate form --suite simpler-bridge --episodes 6")
         return
@@ -308,11 +307,8 @@ def ablate(asked: AskedOfAblation) -> None:
     from vap_core.study.ablations import ablate_text
 
     about = ABLATIONS[name]
-    if about.policies and asked.policy is not None:
-        raise BadStudy(f"ablate {name}: it compares policies of its own; leave --policy out.")
     given: dict[str, Any] = {"suite": asked.suite or list(about.suites)}
-    given |= {"methods": list(about.names)}
-    given["policy"] = next(iter(about.policies.values()), asked.policy)
+    given |= {"methods": list(about.names), "policy": asked.policy}
     of_study = {field: getattr(asked, field) for field in ("episodes", "seeds", "split")}
     study = study_of(AskedOfAll(**given, **of_study))
     print(ablate_text(name, study, asked.out, workers=asked.workers))

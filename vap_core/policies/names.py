@@ -11,7 +11,6 @@ _NEWER = {
     "simpler-bridge": f"{MINI}-simpler-bridge-wide-seed-0",
     "simpler-fractal": f"{MINI}-simpler-fractal-wide",
     "tabletop": f"{MINI}-tabletop-longer",
-    "vlabench": f"{MINI}-vlabench-wide",
 }
 """The checkpoint of a benchmark whose first one, `mini-pi0-BENCHMARK`, was replaced."""
 POLICIES = ("scripted", "expert", "random")

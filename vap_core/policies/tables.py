@@ -1,6 +1,6 @@
 """A model's table of word embeddings, read by name from its safetensors files in blocks of rows.
 
-    table = open_table(Path("data/policies/mini-paligemma-tint-free"))
+    table = open_table(Path("data/policies/mini-paligemma"))
     table.block(0, 64)                                # 64 x width, float32
 
 It works on a folder of a PaliGemma, of a pi0, pi0.5 or SmolVLA as lerobot saves it, and of the

@@ -10,12 +10,9 @@ from . import steps as steps
 from . import survey as survey
 from . import tokens as tokens
 from .ablations import ablation_table as ablation_table
-from .ablations import across_policies as across_policies
 from .ablations import effect_text as effect_text
 from .ablations import effects_figure as effects_figure
 from .ablations import findings_table as findings_table
-from .ablations import policies_figure as policies_figure
-from .ablations import policy_tables as policy_tables
 from .ablations import published_episodes as published_episodes
 from .ablations import rates_figure as rates_figure
 from .ablations import shown_table as shown_table

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from vap_core.base.errors import BadOutput
 from vap_core.base.files import signed, writing
 from vap_core.base.pictures import write_png
-from vap_core.policies.names import TEMPERATURE, checkpoint_of
 from vap_core.study import charts, paper, store
 from vap_core.study.engine import Record, run
 from vap_core.study.logs import hiding_lines, switching_lines
@@ -72,8 +71,7 @@ def arm_table(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
         if len(policies) > 1:
             raise BadOutput(
                 f"arm_table: the arms on {suite} are of {len(policies)} policies "
-                f"({', '.join(policies)}); name one: keep its rows alone. policy_tables compares "
-                "several."
+                f"({', '.join(policies)}); name one: keep its rows alone."
             )
         against = _against_first(arms, of_suite, ablation.retired)
         for arm in arms:
@@ -128,46 +126,6 @@ def _paper_sr(ablation: Ablation, suite: str, arm: str) -> float:
     return float(facts["value"].iloc[0]) / 100 if len(facts) else float("nan")
 
 
-def policy_tables(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """The methods of an ablation of policies, with the label of the `policy` that was run; each
-    method against the first one with the same policy.
-
-    Raises: as `arm_table`.
-    """
-    import pandas as pd
-
-    tables = []
-    for label, checkpoint in ablation.policies.items():
-        arms = arm_table(ablation, _of_checkpoint(episodes, checkpoint))
-        arms.insert(0, "policy", label)
-        tables.append(arms)
-    return pd.concat([table for table in tables if len(table)], ignore_index=True)
-
-
-def across_policies(ablation: Ablation, episodes: "pd.DataFrame") -> "pd.DataFrame":
-    """The last method of an ablation of policies; its arms are the labels of the policies, each
-    against the first one on the same episodes.
-
-    Raises: as `arm_table`.
-    """
-    import pandas as pd
-
-    method = ablation.names[-1]
-    parts = []
-    for label, checkpoint in ablation.policies.items():
-        part = _of_checkpoint(episodes, checkpoint)
-        parts.append(part[part["method"] == method].assign(method=label, policy=method))
-    labels = Ablation(ablation.question, arms={}, methods=tuple(ablation.policies))
-    return arm_table(labels, pd.concat(parts, ignore_index=True))
-
-
-def _of_checkpoint(episodes: "pd.DataFrame", checkpoint: str) -> "pd.DataFrame":
-    """The rows of a checkpoint of that name, with its own sampling noise."""
-    labels = episodes["policy"]
-    named = labels.map(checkpoint_of) == Path(checkpoint).name
-    return episodes[named & ~labels.str.contains(TEMPERATURE, regex=False)]
-
-
 def published_episodes(path: Path) -> "pd.DataFrame":
     """Every episode of a published table. Raises: BadOutput."""
     import pandas as pd
@@ -178,8 +136,7 @@ def published_episodes(path: Path) -> "pd.DataFrame":
 def ablation_table(episodes: "pd.DataFrame", *suites: str) -> "pd.DataFrame":
     """The arms of every `ablation` that has been run, each against the first of its ablation.
 
-    Of these suites, or of those that an ablation runs on where none is named. Those of policies are
-    not among them (`policy_tables`, `across_policies`).
+    Of these suites, or of those that an ablation runs on where none is named.
 
     Raises: as `arm_table`.
     """
@@ -188,8 +145,6 @@ def ablation_table(episodes: "pd.DataFrame", *suites: str) -> "pd.DataFrame":
     tables = [pd.DataFrame(columns=["ablation", *COLUMNS, "paper_difference"])]
     for name, ablation in ABLATIONS.items():
         wanted = episodes["suite"].isin(suites or ablation.suites)
-        if ablation.policies:
-            continue
         arms = arm_table(ablation, episodes[wanted])
         if len(arms):
             arms.insert(0, "ablation", name)
@@ -271,13 +226,6 @@ def sweep_figure(arms: "pd.DataFrame", places: dict[str, float], label: str) -> 
     )
 
 
-def policies_figure(arms: "pd.DataFrame", label: str) -> "Figure":
-    """The success rate of every method (95 %), with the policies of `policy_tables` side by side;
-    `label` says what tells them apart."""
-    rates = tidy(arms[["policy", "arm", "sr"]], ["sr"])
-    return charts.bars(rates, "policy", series="arm", label="success rate, % (95 %)", label_x=label)
-
-
 def effect_text(arms: "pd.DataFrame", arm: str, suite: str = "") -> str:
     """Points of success of an arm against the first, with its interval; of the first its rate.
 
@@ -333,28 +281,17 @@ def ablate_text(
     ablation = ABLATIONS[name]
     episodes = run_arms(name, study, root, workers=workers, record=record)
     picture = root / f"{name}.png"
-    if ablation.policies:
-        of_policies = policy_tables(ablation, episodes)
-        tables = []
-        for label, arms in of_policies.groupby("policy", sort=False):
-            tables += [f"{label}: {ablation.policies[str(label)]}", printed(shown_table(arms))]
-        across = printed(shown_table(across_policies(ablation, episodes)))
-        tables += [f"{ablation.names[-1]} with every policy, against the first", across]
-        figure, policy = policies_figure(of_policies, name), "each by its label"
-    else:
-        arms = arm_table(ablation, episodes)
-        tables, figure = [printed(shown_table(arms))], effects_figure(arms, ablation.question)
-        policy = study.policy
+    arms = arm_table(ablation, episodes)
     with writing(picture, "ablate"):
-        write_png(figure, picture, dpi=200)
+        write_png(effects_figure(arms, ablation.question), picture, dpi=200)
     errors = int(episodes["outcome"].eq("error").sum())
     first = arm_folder(study, root, ablation.names[0])
     lines = [
         ablation.question,
-        *tables,
+        printed(shown_table(arms)),
         *switching_lines(episodes),
         *hiding_lines(episodes),
-        f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {policy}; "
+        f"n episodes a suite, {study.seeds} seed(s) from {study.seed}; policy {study.policy}; "
         f"{errors} errors. Intervals of rates: over layouts where they return, else Wilson's; of "
         "differences: cluster bootstrap over layouts. p exact, Holm's correction over the arms of "
         "a suite.",
@@ -370,19 +307,16 @@ def run_arms(
     """The episodes of every arm of an ablation; those that `root` lacks are run.
 
     Each arm is a run in a folder of its own, so that ablations share the arms that they have in
-    common; so is each arm with each policy, where the ablation has policies.
+    common.
 
     Raises: what `engine.run` raises.
     """
     import pandas as pd
 
     tables = []
-    for policy in ABLATIONS[name].policies.values() or (study.policy,):
-        with_policy = replace(study, policy=policy)
-        for arm in ABLATIONS[name].names:
-            of_arm = replace(with_policy, methods=(arm,))
-            folder = arm_folder(with_policy, root, arm)
-            tables.append(run(of_arm, folder, workers=workers, record=record))
+    for arm in ABLATIONS[name].names:
+        folder = arm_folder(study, root, arm)
+        tables.append(run(replace(study, methods=(arm,)), folder, workers=workers, record=record))
     columns = dict.fromkeys(chain.from_iterable(tables))
     kept = [table.dropna(axis="columns", how="all") for table in tables]
     return pd.concat(kept, ignore_index=True).reindex(columns=list(columns))

@@ -70,9 +70,8 @@ class Ablation:
 
     `paper` is the paper's table (data/paper_tables.csv), `rows` its row for each arm that it has.
     Arms named in `methods` are methods already, or arms of another ablation.
-    `suites` are those that it runs on where none is named. `policies` are checkpoints by label: the
-    methods are run with each of them, and the last method is compared over them. `retired` counts
-    arms that were tried on the same lists and are no longer here: Holm's correction counts them.
+    `suites` are those that it runs on where none is named. `retired` counts arms
+    that were tried on the same lists and are no longer here: Holm's correction counts them.
     """
 
     question: str
@@ -81,7 +80,6 @@ class Ablation:
     suites: tuple[str, ...] = ("simpler-bridge",)
     paper: str = ""
     rows: Mapping[str, str] = field(default_factory=dict)
-    policies: Mapping[str, str] = field(default_factory=dict)
     retired: int = 0
 
     @property
@@ -90,15 +88,6 @@ class Ablation:
         return (*self.methods, *self.arms)
 
 
-_OF_BRIDGE = "data/policies/mini-pi0-simpler-bridge"
-TINT_SHARES = {
-    "share-0": f"{_OF_BRIDGE}-any-start",
-    "share-0.1": f"{_OF_BRIDGE}-tint-share-0.1",
-    "share-0.2": f"{_OF_BRIDGE}-tint-share-0.2",
-    "share-0.5": f"{_OF_BRIDGE}-tint-share-0.5",
-}
-"""Policies of one recipe, of the same films, seed and mini-PaliGemma, by the share of their
-training scenes that were tinted."""
 UNTRAINED = (Colour("orange", (255, 128, 0)), Colour("purple", (128, 0, 255)))
 """Colours that no shipped policy was trained with as tints; in their films things were painted in
 them, and commands named them."""
@@ -242,12 +231,6 @@ ABLATIONS: dict[str, Ablation] = {
             "obeys-contour": Oracle("mask", prompting=Prompting(form=Contour())),
         },
         methods=("generic", "rewrite-only", "oracle-mask", "wrong-mask"),
-    ),
-    "tint-share": Ablation(
-        question="How much of the gain was taught by tints in the policy's training?",
-        arms={},
-        methods=("generic", "rewrite-only", "mask-only", DEFAULT),
-        policies=TINT_SHARES,
     ),
 }
 """Every ablation by name; the first method of each is what the others are compared with."""

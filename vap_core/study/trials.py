@@ -124,7 +124,9 @@ def policy_today(policy: str, label: str, suite: str) -> str:
     name = checkpoint_of(label)
     if not name or is_checkpoint_name(policy) or not (policy == MINI or (SHIPPED / name).is_dir()):
         return policy
-    return MINI if name == shipped(suite).name else f"data/policies/{name}"
+    default = shipped(suite)
+    of_default = name == default.name and label.startswith(label_of(default))
+    return MINI if of_default else f"data/policies/{name}"
 
 
 def default_policy(suites: Iterable[str]) -> str:

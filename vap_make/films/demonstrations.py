@@ -426,10 +426,15 @@ def _write_stage(path: Path, made: Sequence[Film], cpu_s: float) -> None:
         write_atomic(path, buffer.getvalue())
 
 
+def has_every(film: Film, interval: int) -> bool:
+    """Whether there are as many pictures as one every `interval` steps makes."""
+    return len(film.images) == -(-len(film.action) // interval)
+
+
 def _require_pictures(film: Film, interval: int, path: Path) -> None:
     """Raises: BadOutput when there is not a picture every `interval` steps."""
     steps = len(film.action)
-    if len(film.images) != -(-steps // interval):
+    if not has_every(film, interval):
         raise BadOutput(
             f"train: {path} holds films of another recipe ({len(film.images)} pictures of {steps} "
             f"steps, one is wanted every {interval}); choose another --cache, or delete it and run "

@@ -1,7 +1,7 @@
 """Commands for filmed frames: one demonstration teaches many.
 
 *Coloured*: the target is called by its colour, which is that of its materials (`colours.seen` of
-the pictures), or a tint's where the recipe has any. *Described*: as a hard prompt does it, in the
+the pictures). *Described*: as a hard prompt does it, in the
 captioner's words. *Learned*: by a learned word, as a soft prompt does it. *Plain*: the command does
 not say which object is meant; only frames in which the hand is nearer to the target than to any
 rival, so that a plain command means what the hand already nears. A pair's command is plain, or
@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
-from vap_core.base.types import Colour, Description, value
+from vap_core.base.types import Description, value
 from vap_core.policies.mini_pi0.learned_token import WORD
 from vap_core.rollout.prompters import soft_prompt
 from vap_core.simulation import robots
@@ -27,8 +27,7 @@ from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import Task, suite
 from vap_make.colours import seen, stands_out
 from vap_make.films.captions import distinguishes
-from vap_make.films.demonstrations import Film
-from vap_make.policy.tints import Images, draw_tints, tint_views
+from vap_make.films.demonstrations import Film, has_every
 from vap_make.recipe import FILMED, Recipe, filmed_task
 from vap_make.words import DETERMINERS
 
@@ -38,6 +37,8 @@ NEAR_M = 0.02
 """A hand that is nearer to its target than to any rival by this much gives its choice away."""
 Form = Literal["coloured", "described", "learned", "plain"]
 Embedding = Float32[np.ndarray, " d"]
+Images = UInt8[np.ndarray, "c s s 3"]
+"""The views of one frame."""
 Seen = tuple[str, frozenset[str]]
 """What an object is called by its colour, and the colours that it shows, as `colours.seen`."""
 
@@ -58,7 +59,7 @@ class Command:
     """One training sample: views and words, and how the two name the target.
 
     `things` are the numbers of the film's target, which comes first, of its rivals, and last of a
-    pair's goal; `tints` counts them. `embedding` is that of the learned word in `text`, if there is
+    pair's goal. `embedding` is that of the learned word in `text`, if there is
     one.
     """
 
@@ -66,7 +67,6 @@ class Command:
     text: str
     form: Form
     things: tuple[int, ...]
-    tints: Mapping[int, Colour]
     embedding: Embedding | None = None
 
 
@@ -92,18 +92,17 @@ def command(
 
     `colours` are `colours_of` the film. None where the form that was drawn does not fit the frame.
 
-    Raises: UnknownName for a film of a task that the recipe's suite does not film.
+    Raises: UnknownName for a film of a task that the recipe's suite does not film; ValueError for
+        one that is not `thinned` as the recipe says.
     """
+    if not has_every(film, recipe.interval):
+        raise ValueError(f"command: the film has not a picture every {recipe.interval} steps")
     task = filmed_task(recipe.suite, film.task)
     pairs = FILMED[recipe.suite].pairs
     things = nameable(film, recipe.suite)
     names = [film.names[i] for i in things]
     length: Literal["short", "long"] = "long" if rng.random() < 0.5 else "short"
     words, shown = map(list, zip(*(colours[i] for i in things), strict=True))
-    tints = draw_tints(len(things), recipe, rng, at_once=2 if pairs else 1)
-    for i, colour in tints.items():
-        words[i] = colour.name
-        shown[i] |= {colour.name}
     form = _draw_form(recipe, names[0] in known.learned, rng)
     embedding = None
     if form == "coloured":
@@ -127,14 +126,9 @@ def command(
         if not near(film, t, recipe.suite, things[1:]):
             return None
         text = phrase_instruction(task, "", rng)
-    picture = t // recipe.interval
-    images = film.images[picture]
-    if tints:
-        owned = {things[i]: colour for i, colour in tints.items()}
-        images = tint_views(images, film.ids[picture], owned, rng)
     gain = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
-    lit = np.clip(images * gain, 0, 255).astype(np.uint8)
-    return Command(lit, text, form, tuple(things), tints, embedding)
+    lit = np.clip(film.images[t // recipe.interval] * gain, 0, 255).astype(np.uint8)
+    return Command(lit, text, form, tuple(things), embedding)
 
 
 def nameable(film: Film, suite_name: str) -> list[int]:

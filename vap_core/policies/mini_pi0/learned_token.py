@@ -272,7 +272,7 @@ def _check_kinds(name: str, photos: Photos) -> None:
         )
 
 
-MODEL = DATA / "policies" / "mini-paligemma-tint-free"
+MODEL = DATA / "policies" / "mini-paligemma"
 """The shipped vision-language model that the default policies were initialised from.
 
 That of the first policies lies beside it in a clone (`model_of`).
