@@ -10,9 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.command import refused, vap
-from vap_core.base.errors import BadEndpoint
+from vap_core.base.errors import BadEndpoint, BadStudy
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
+from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study import parsers
@@ -21,6 +22,8 @@ from vap_core.study.parsers import (
     PARTS,
     Paraphrase,
     ParserMeasurement,
+    implicit_instruction,
+    implicit_parser,
     paraphrase_digest,
     paraphrases,
     read_families,
@@ -185,3 +188,23 @@ def test_the_page_quotes_the_published_table() -> None:
         assert right == f"{line['right']} {ends}"
         for text, share in ((silent, line["abstains"]), (wrong, line["wrong object"])):
             assert text == f"{100 * share.value:.0f} %"
+
+
+@pytest.mark.parametrize("suite", ["simpler-bridge", "simpler-fractal"])
+def test_an_implicit_instruction_of_an_episode_means_its_target(suite: str) -> None:
+    """It does not say "my cup", and what stands around the expression is the task's own sentence."""
+    said = set()
+    for task in suites.suite(suite).tasks:
+        for row in suites.rows(suite, task.name)[:12]:
+            text, _ = implicit_instruction(row)
+            (target,) = implicit_parser(row)("anything").targets
+            assert target.object == row.target
+            assert f"my {target.category}" not in text
+            found = f"{text[: target.start]}my {target.category}{text[target.stop :]}"
+            assert found == row.instruction
+            said.add(text)
+    assert len(said) > 10
+    dev = f"{suite}-dev"
+    row = suites.rows(dev, suites.suite(dev).tasks[0].name)[0]
+    with pytest.raises(BadStudy, match=f"no paraphrases of {row.target}"):
+        implicit_instruction(row)

@@ -61,6 +61,11 @@ class Hidden:
     prompting: Prompting = field(default_factory=Prompting)
 
 
+@dataclass(frozen=True)
+class Implicit(Prompting):
+    """The method, told what the object is for, or when it was used, instead of "my cup"."""
+
+
 type Arm = Prompting | Oracle | Hidden | Switch | OtherCommand | Arrow
 
 
@@ -210,6 +215,10 @@ ABLATIONS: dict[str, Ablation] = {
         methods=(DEFAULT, "vap-associated"),
         suites=("vlabench", "tabletop"),
         retired=7,
+    ),
+    "implicit": Ablation(
+        question='Does an instruction that does not say "my" do as well?',
+        arms={"vap-implicit": Implicit()},
     ),
     "switch": Ablation(
         question="Does the policy follow the tint to a look-alike in mid-episode?",
@@ -438,6 +447,11 @@ def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) 
     known = load_bank(bank, stack.encoder.name)
     # Other methods of the run may have wanted more photos.
     n_references = how.references or FEWEST_REFERENCES
+    if isinstance(how, Implicit):
+        from vap_core.study.parsers import implicit_parser
+
+        remembered = {name: obj.first(n_references) for name, obj in known.items()}
+        return Attender(stack, remembered, how, implicit_parser(row))
     if not row.owned:
         return Attender(stack, {row.target: known[row.target].first(n_references)}, how)
     memory = {}
@@ -450,4 +464,4 @@ def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) 
 def suits_shared(method: str) -> bool:
     """Whether a method can be used where several objects are remembered: text for one cannot."""
     how = find(method)
-    return how is None or isinstance(how, Prompting)
+    return how is None or (isinstance(how, Prompting) and not isinstance(how, Implicit))

@@ -25,6 +25,7 @@ from vap_core.instruction import Parser
 from vap_core.instruction.context import Context, Use
 from vap_core.instruction.parsers import load_parser
 from vap_core.memory import recall
+from vap_core.simulation.types import EpisodeRow
 from vap_core.study import charts
 from vap_core.study.measurement import Row
 from vap_core.study.stats import resampled_mean, share
@@ -86,6 +87,45 @@ def paraphrases(suite: str, part: str) -> list[Paraphrase]:
         if family["part"] == part:
             found += list(_of_family(suite, family, number))
     return found
+
+
+ALONE = re.compile(r"[^{]*\{do\} \[(.+)\] \{where\}[^{]*")
+"""A sentence whose expression says by itself what is meant."""
+
+
+def implicit_instruction(row: EpisodeRow) -> tuple[str, Context]:
+    """A row's instruction with an expression in place of "my CATEGORY", and its context.
+
+    The expression says what the object is for, or when it was used; its family is held out, and
+    each episode of a task has the next one.
+
+    Raises: BadStudy: the target has no paraphrases.
+    """
+    vocabulary = read_vocabulary()
+    of_target = {about["first"]["object"]: key for key, about in vocabulary["objects"].items()}
+    key = of_target.get(row.target)
+    if key is None:
+        raise BadStudy(f"vap-implicit: {FOLDER} has no paraphrases of {row.target}.")
+    suite = next(s for s, about in vocabulary["suites"].items() if key in about["objects"])
+    alone = [
+        (family, found[1])
+        for family in read_families()
+        if (family["part"], family["memory"]) == ("test", "own")
+        and family["kind"] in ("implicit", "history")
+        and (found := ALONE.fullmatch(family["text"]))
+    ]
+    family, template = alone[row.episode % len(alone)]
+    said = _fill(template, _words(key, family, False, row.episode))
+    category = vocabulary["objects"][key]["category"]
+    text = row.instruction.replace(f"my {category}", said, 1)
+    return text, _context(suite, family, row.target)
+
+
+def implicit_parser(row: EpisodeRow) -> Parser:
+    """Reads `implicit_instruction` of the row, whatever it is given. Raises: as that."""
+    text, context = implicit_instruction(row)
+    parser = load_parser("embedding", context)
+    return lambda _, categories=(): parser(text, categories)
 
 
 def _of_family(suite: str, family: Mapping[str, str], number: int) -> Iterator[Paraphrase]:
