@@ -13,6 +13,7 @@ from tests.command import refused, vap
 from vap_core.base.errors import BadEndpoint, BadStudy
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
+from vap_core.instruction.parsers import load_parser
 from vap_core.simulation import suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import BENCHMARKS
@@ -208,3 +209,13 @@ def test_an_implicit_instruction_of_an_episode_means_its_target(suite: str) -> N
     row = suites.rows(dev, suites.suite(dev).tasks[0].name)[0]
     with pytest.raises(BadStudy, match=f"no paraphrases of {row.target}"):
         implicit_instruction(row)
+
+
+def test_it_is_what_was_named_before() -> None:
+    """ "I want the vase from earlier: put it into the bowl" once had two targets."""
+    (one,) = [each for each in paraphrases("simpler-bridge", "test") if each.text == EARLIER]
+    (target,) = load_parser("embedding", one.context)(EARLIER).targets
+    assert (target.object, target.start) == (one.object, one.start)
+
+
+EARLIER = "I want the camera from earlier: put it on the plate."

@@ -406,8 +406,8 @@ class EmbeddingParser:
         expressions = list(find_expressions(text, exclusions, people))
         last = 0
         for expression in expressions:
-            if expression.start < last:
-                continue
+            if expression.start < last or (found and expression.kind == "it"):
+                continue  # "it" is what was named before
             try:
                 obj = Reading(
                     self.context, self.embed, text, expression, expressions, exclusions
