@@ -24,10 +24,10 @@ from vap_core.study.parsers import (
     Paraphrase,
     ParserMeasurement,
     implicit_instruction,
-    implicit_parser,
     paraphrase_digest,
     paraphrases,
     read_families,
+    read_implicit,
     read_vocabulary,
     suite_names,
 )
@@ -198,7 +198,7 @@ def test_an_implicit_instruction_of_an_episode_means_its_target(suite: str) -> N
     for task in suites.suite(suite).tasks:
         for row in suites.rows(suite, task.name)[:12]:
             text, _ = implicit_instruction(row)
-            (target,) = implicit_parser(row)("anything").targets
+            (target,) = read_implicit(row).targets
             assert target.object == row.target
             assert f"my {target.category}" not in text
             found = f"{text[: target.start]}my {target.category}{text[target.stop :]}"

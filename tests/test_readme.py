@@ -120,6 +120,15 @@ def test_what_shared_scenes_reach() -> None:
     assert f"pairs {of_way(pair, 'vap').replace(' [', ' % [')} of {len(pair)}" in PROSE
 
 
+def test_what_implicit_instructions_reach() -> None:
+    found = []
+    for _, told in episodes_of("implicit").groupby("suite"):
+        found += [of_way(told, way).split()[0] for way in ("vap-implicit", "vap")]
+    implicit, explicit, *more = found
+    said = f'in {implicit} % of simpler-bridge\'s 96 episodes, and in {explicit} told "my"; '
+    assert f"{said}of vlabench's 250 in {' and '.join(more)} (" in PROSE
+
+
 def test_what_libero_reaches() -> None:
     found = results(load_runs([RESULTS / "libero.parquet"]))
     cells = []

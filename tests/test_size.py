@@ -12,7 +12,7 @@ from vap_core.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {
-    "= vap_core": {"files": 196, "nodes": 243_310, "functions": 2_795},
+    "= vap_core": {"files": 196, "nodes": 243_340, "functions": 2_795},
     "= vap_make": {"files": 65, "nodes": 74_850, "functions": 790},
 }
 COMMANDS, OPTIONS = 21, 234

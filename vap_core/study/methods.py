@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.attend import Attender, Prompting
-from vap_core.base.errors import BadStudy
+from vap_core.base.errors import BadStudy, VapError
 from vap_core.base.files import source_digest
-from vap_core.base.types import Colour
+from vap_core.base.types import Colour, Instruction
 from vap_core.environments import AnyScene
 from vap_core.memory import load_bank
 from vap_core.perception.protocols import Stack
@@ -403,6 +403,14 @@ def make_prompter(
             return say("")
         case OtherCommand():
             return say(_next_command(row))
+        case Implicit() as how:
+            from vap_core.study.parsers import implicit_instruction, read_implicit
+
+            try:
+                read = read_implicit(row)
+            except VapError:  # The parser abstains, and the policy reads what was said.
+                return say(implicit_instruction(row)[0])
+            return TintPrompter(_attender(how, row, bank, stack, read))
         case Prompting() as how:
             return TintPrompter(_attender(how, row, bank, stack))
         case Hidden(prompting=how):
@@ -441,17 +449,22 @@ def _next_command(row: EpisodeRow) -> str:
     raise BadStudy(f"other-text: {row.suite} has one command only; leave other-text out.")
 
 
-def _attender(how: Prompting, row: EpisodeRow, bank: Path, stack: Stack | None) -> Attender:
-    """The method with the row's target in memory; in a shared scene with every owned object."""
+def _attender(
+    how: Prompting,
+    row: EpisodeRow,
+    bank: Path,
+    stack: Stack | None,
+    read: Instruction | None = None,
+) -> Attender:
+    """The method with the row's target in memory; in a shared scene with every owned object, and
+    with everything that is remembered for an instruction that was `read` already."""
     assert stack is not None, "a method that prompts needs a stack"
     known = load_bank(bank, stack.encoder.name)
     # Other methods of the run may have wanted more photos.
     n_references = how.references or FEWEST_REFERENCES
-    if isinstance(how, Implicit):
-        from vap_core.study.parsers import implicit_parser
-
+    if read is not None:
         remembered = {name: obj.first(n_references) for name, obj in known.items()}
-        return Attender(stack, remembered, how, implicit_parser(row))
+        return Attender(stack, remembered, how, lambda *_: read)
     if not row.owned:
         return Attender(stack, {row.target: known[row.target].first(n_references)}, how)
     memory = {}

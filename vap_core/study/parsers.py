@@ -121,11 +121,13 @@ def implicit_instruction(row: EpisodeRow) -> tuple[str, Context]:
     return text, _context(suite, family, row.target)
 
 
-def implicit_parser(row: EpisodeRow) -> Parser:
-    """Reads `implicit_instruction` of the row, whatever it is given. Raises: as that."""
+def read_implicit(row: EpisodeRow) -> Instruction:
+    """What the parser `embedding` reads in `implicit_instruction` of the row.
+
+    Raises: as that; BadInstruction, UnknownName, where the parser abstains.
+    """
     text, context = implicit_instruction(row)
-    parser = load_parser("embedding", context)
-    return lambda _, categories=(): parser(text, categories)
+    return load_parser("embedding", context)(text)
 
 
 def _of_family(suite: str, family: Mapping[str, str], number: int) -> Iterator[Paraphrase]:
