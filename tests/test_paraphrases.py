@@ -10,14 +10,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.command import refused, vap
-from vap_core.base.errors import BadEndpoint, BadStudy
+from vap_core.base.errors import BadEndpoint, BadInstruction, BadStudy, MissingWeights
 from vap_core.base.types import Instruction, Target
 from vap_core.instruction.context import Context
 from vap_core.instruction.parsers import load_parser
-from vap_core.simulation import suites
+from vap_core.rollout.prompters import TextPrompter
+from vap_core.simulation import scenes, suites
 from vap_core.simulation.assets.objects import get_object
 from vap_core.simulation.suites import BENCHMARKS
 from vap_core.study import parsers
+from vap_core.study.methods import make_prompter
 from vap_core.study.parsers import (
     KINDS,
     PARTS,
@@ -219,3 +221,24 @@ def test_it_is_what_was_named_before() -> None:
 
 
 EARLIER = "I want the camera from earlier: put it on the plate."
+
+
+def test_where_the_parser_abstains_the_policy_reads_what_was_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = suites.rows("simpler-bridge", "pick-shaver")[0]
+
+    def fails(error: Exception) -> None:
+        def read(row: object) -> None:
+            raise error
+
+        monkeypatch.setattr(parsers, "read_implicit", read)
+
+    scene = scenes.build("wx250s", ["shaver-personal"])
+    fails(BadInstruction("parse: several fit"))
+    prompter = make_prompter("vap-implicit", row, tmp_path, scene, None)
+    assert isinstance(prompter, TextPrompter)
+    assert prompter.rewrite(row.instruction) == implicit_instruction(row)[0]
+    fails(MissingWeights("text encoder"))
+    with pytest.raises(MissingWeights):
+        make_prompter("vap-implicit", row, tmp_path, scene, None)

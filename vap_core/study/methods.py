@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vap_core.attend import Attender, Prompting
-from vap_core.base.errors import BadStudy, VapError
+from vap_core.base.errors import BadInstruction, BadStudy, UnknownName
 from vap_core.base.files import source_digest
 from vap_core.base.types import Colour, Instruction
 from vap_core.environments import AnyScene
@@ -408,7 +408,10 @@ def make_prompter(
 
             try:
                 read = read_implicit(row)
-            except VapError:  # The parser abstains, and the policy reads what was said.
+            except (
+                BadInstruction,
+                UnknownName,
+            ):  # It abstains, and the policy reads that.
                 return say(implicit_instruction(row)[0])
             return TintPrompter(_attender(how, row, bank, stack, read))
         case Prompting() as how:
