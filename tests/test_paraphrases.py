@@ -234,11 +234,11 @@ def test_where_the_parser_abstains_the_policy_reads_what_was_said(
 
         monkeypatch.setattr(parsers, "read_implicit", read)
 
-    scene = scenes.build("wx250s", ["shaver-personal"])
-    fails(BadInstruction("parse: several fit"))
-    prompter = make_prompter("vap-implicit", row, tmp_path, scene, None)
-    assert isinstance(prompter, TextPrompter)
-    assert prompter.rewrite(row.instruction) == implicit_instruction(row)[0]
-    fails(MissingWeights("text encoder"))
-    with pytest.raises(MissingWeights):
-        make_prompter("vap-implicit", row, tmp_path, scene, None)
+    with scenes.build("wx250s", ["shaver-personal"]) as scene:
+        fails(BadInstruction("parse: several fit"))
+        prompter = make_prompter("vap-implicit", row, tmp_path, scene, None)
+        assert isinstance(prompter, TextPrompter)
+        assert prompter.rewrite(row.instruction) == implicit_instruction(row)[0]
+        fails(MissingWeights("text encoder"))
+        with pytest.raises(MissingWeights):
+            make_prompter("vap-implicit", row, tmp_path, scene, None)

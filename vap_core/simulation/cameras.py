@@ -173,8 +173,8 @@ def project(cam: Camera, points_world: Float64[np.ndarray, "n 3"]) -> Float64[np
 class Renderer:
     """Renders a model's cameras: colours, and object masks on demand.
 
-    One renderer per picture size and number of samples a pixel. `objects`
-    names the bodies whose masks can be asked for; a hidden object is not drawn at all.
+    One renderer per picture size and number of samples a pixel. `objects` names the bodies whose
+    masks can be asked for; a hidden object is not drawn at all.
     """
 
     def __init__(

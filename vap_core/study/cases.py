@@ -400,9 +400,9 @@ def _missed_grasp(trace: EpisodeTrace, thresholds: Thresholds) -> Diagnosis | No
         sentence = f"touches but does not grasp {trace.target}{_distance_words(trace, at)}"
     else:
         return None
-    if any(trace.others[:at]):
-        names = next(filter(None, trace.others))
-        sentence = f"touches {names[0]} first, then {sentence}"
+    strayed = first_true(trace.others[:at])
+    if strayed is not None:
+        sentence = f"touches {trace.others[strayed][0]} first, then {sentence}"
     return _diagnosis(trace, "missed grasp", at, sentence)
 
 

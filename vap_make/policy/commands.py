@@ -1,11 +1,11 @@
 """Commands for filmed frames: one demonstration teaches many.
 
 *Coloured*: the target is called by its colour, which is that of its materials (`colours.seen` of
-the pictures). *Described*: as a hard prompt does it, in the
-captioner's words. *Learned*: by a learned word, as a soft prompt does it. *Plain*: the command does
-not say which object is meant; only frames in which the hand is nearer to the target than to any
-rival, so that a plain command means what the hand already nears. A pair's command is plain, or
-names both its objects by their colours.
+the pictures). *Described*: as a hard prompt does it, in the captioner's words. *Learned*: by a
+learned word, as a soft prompt does it. *Plain*: the command does not say which object is meant;
+only frames in which the hand is nearer to the target than to any rival, so that a plain command
+means what the hand already nears. A pair's command is plain, or names both its objects by their
+colours.
 
 The form is drawn before it is asked whether it fits, and a frame that it does not fit is left out:
 what an object looks like says nothing about whether a plain or described command means it.
@@ -59,8 +59,7 @@ class Command:
     """One training sample: views and words, and how the two name the target.
 
     `things` are the numbers of the film's target, which comes first, of its rivals, and last of a
-    pair's goal. `embedding` is that of the learned word in `text`, if there is
-    one.
+    pair's goal. `embedding` is that of the learned word in `text`, if there is one.
     """
 
     images: Images

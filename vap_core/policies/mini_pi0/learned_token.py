@@ -273,9 +273,9 @@ def _check_kinds(name: str, photos: Photos) -> None:
 
 
 MODEL = DATA / "policies" / "mini-paligemma"
-"""The shipped vision-language model that the default policies were initialised from.
+"""The shipped vision-language model of today's recipe.
 
-That of the first policies lies beside it in a clone (`model_of`).
+That of earlier policies lies beside it (`model_of`).
 """
 K = 5
 """Photos of the object to learn from."""
